@@ -1,12 +1,12 @@
-//! Writes the place of libtorch into the run path of every binary, test and benchmark of the package that names this
-//! file as its build script, so that none of them needs LD_LIBRARY_PATH.
+//! Build script: writes the path of libtorch into the run path of every binary, test and benchmark of a package that
+//! names this file as its build script, so that none of them needs LD_LIBRARY_PATH.
 
 use std::env;
 
 fn main() {
-    // No file but this one counts, and Cargo compiles and runs it again by itself where it has changed.
+    // No other file is an input; Cargo compiles and runs this script again by itself when it changes.
     println!("cargo:rerun-if-env-changed=LIBTORCH");
-    // Set by the build script of torch-sys, however it was told where libtorch is.
+    // Set by the build script of torch-sys, however it found libtorch.
     let Ok(lib_dir) = env::var("DEP_TCH_LIBTORCH_LIB") else {
         return;
     };

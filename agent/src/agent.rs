@@ -1,4 +1,4 @@
-//! The pipeline of one vehicle: a sweep in, its pose, its map and its own detections out.
+//! Pipeline of one vehicle: from a sweep to its pose, its BEV feature map and its own detections.
 //!
 //! Synchronous and without any network: live process, offline evaluation, tests and benches run the same lines.
 
@@ -15,42 +15,43 @@ use localization::pose_source::{PoseInput, PoseSource};
 use perception::boxes::postprocess::{AgentBoxes, PostprocessConfig, postprocess};
 use perception::detector::{Detector, DetectorError};
 
-/// Everything known about one sweep.
+/// All inputs of one sweep.
 #[derive(Debug, Clone, Copy)]
 pub struct AgentInput<'a> {
     /// Capture time on the clock of the scene, nanoseconds.
     pub capture_nanos: u64,
     /// The sweep, in the LiDAR frame.
     pub cloud: &'a PointCloud,
-    /// `world_from_lidar` as recorded or measured, where there is one.
+    /// `world_from_lidar` as recorded or measured, if there is one.
     pub measured_pose: Option<&'a Pose>,
 }
 
-/// What the detector makes of one sweep.
+/// Result of the detector for one sweep.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Perception {
-    /// The map for intermediate fusion as it is transmitted: with a compressor, its code.
+    /// The BEV feature map for intermediate fusion as it is transmitted: with a compressor, its code.
     pub features: BevFeatures,
-    /// `[H, W]`, 0..1: where a vehicle is likely; which cells are worth sending.
+    /// `[H, W]`, 0..1: probability of a vehicle per cell; selects the cells that are sent.
     pub confidence: Vec<f32>,
-    /// What this vehicle detects alone, in its own LiDAR frame, for late fusion.
+    /// Detections of this vehicle by itself, in its own LiDAR frame, for late fusion.
     pub detections: Vec<Detection>,
-    /// Time of the encoder's stages, of the map's way out of the tensor library, of the head, and of decoding and suppression.
+    /// Durations: the encoder's stages, the copy of the map out of the tensor library, the head, and decoding with
+    /// suppression.
     pub times: Vec<StageTiming>,
 }
 
 /// Pose and perception of one sweep.
 #[derive(Debug, Clone, PartialEq)]
 pub struct AgentOutput {
-    /// Where the vehicle is, or why it does not know.
+    /// Pose of the vehicle, or the reason why there is none.
     pub pose: PoseEstimate,
-    /// Time the pose took.
+    /// Duration of the pose estimation.
     pub pose_time: Duration,
-    /// What it sees.
+    /// Perception of the vehicle.
     pub perception: Perception,
 }
 
-/// One vehicle: where it believes to be and what it sees.
+/// One vehicle: estimates its pose and perceives its surroundings.
 #[derive(Debug)]
 pub struct Agent {
     cav: CavId,
@@ -68,25 +69,25 @@ impl Agent {
         Self { cav, pose_source, detector, postprocess, rate: RateControl::default() }
     }
 
-    /// The same with maps that keep within `rate`, where [`Self::write_map`] writes them.
+    /// The same with feature maps that keep within `rate`, applied by [`Self::write_map`].
     #[must_use]
     pub fn within(self, rate: RateConfig) -> Self {
         Self { rate: RateControl::new(rate), ..self }
     }
 
-    /// The points it shares: those that are not on its own body.
+    /// The points that the vehicle shares: those that are not on its own body.
     #[must_use]
     pub fn share_points(&self, cloud: &PointCloud) -> PointCloud {
         self.detector.crop().without_own_body(cloud)
     }
 
-    /// Who it is.
+    /// Id of the vehicle.
     #[must_use]
     pub fn cav(&self) -> &CavId {
         &self.cav
     }
 
-    /// Its detector.
+    /// Detector of the vehicle.
     #[must_use]
     pub fn detector(&self) -> &Detector {
         &self.detector
@@ -102,8 +103,8 @@ impl Agent {
         })
     }
 
-    /// Last step where there is no queue: the map as `codec` wants it, or smaller where it has to be. A live agent does this
-    /// on its sending thread, with a [`RateControl`] of its own that watches the queue.
+    /// Last step if there is no queue: the feature map as `codec` specifies, or smaller if a limit requires it. A live
+    /// agent does this on its sending thread, with a [`RateControl`] of its own that measures the queue.
     ///
     /// # Errors
     /// As [`RateControl::encode`].
@@ -117,21 +118,21 @@ impl Agent {
         self.rate.encode(features, codec, confidence, capture_nanos, None)
     }
 
-    /// Where the time of the last pose went, for pose sources that compute.
+    /// Durations of the stages of the last pose, for pose sources that compute.
     #[must_use]
     pub fn pose_stages(&self) -> &[StageTiming] {
         self.pose_source.stages()
     }
 
-    /// Poses so far that the vehicle cannot have driven to from those before.
+    /// Number of poses so far that the vehicle cannot have reached from the previous ones.
     #[must_use]
     pub fn pose_jumps(&self) -> u64 {
         self.pose_source.jumps()
     }
 
-    /// Second step: map, confidence and own detections.
+    /// Second step: feature map, confidence and own detections.
     ///
-    /// # Errors
+    /// [`DetectorError`] if the tensor library fails.
     /// [`DetectorError`] when the tensor library refuses.
     pub fn perceive(&mut self, cloud: &PointCloud) -> Result<Perception, DetectorError> {
         let encoded = self.detector.encode(cloud)?;
@@ -139,10 +140,10 @@ impl Agent {
         Ok(Perception { times: [encoded.times, perception.times].concat(), ..perception })
     }
 
-    /// The same from a map `[1, C, H, W]` that the encoder made before, as it came out of it.
+    /// The same from a feature map `[1, C, H, W]` that the encoder computed before, as the encoder returned it.
     ///
     /// # Errors
-    /// [`DetectorError::Shape`] when it is not one of this detector's maps.
+    /// [`DetectorError::Shape`] if it is not a feature map of this detector.
     pub fn perceive_map(&mut self, map: &Tensor) -> Result<Perception, DetectorError> {
         let mut times = StageTimes::start();
         let sent = self.detector.squeezed(map)?;
@@ -191,7 +192,7 @@ mod tests {
         let config = DetectorConfig { lidar_range_m, compress_ratio, ..DetectorConfig::lean() };
         let network = VarStore::new(Device::Cpu);
         let pillars = PointPillars::new(&network.root(), &config).unwrap();
-        // A head that believes in vehicles everywhere gives the clean-up something to do.
+        // A head with vehicles everywhere gives non-maximum suppression something to do.
         let _ = tch::no_grad(|| network.variables()["cls_head.bias"].shallow_clone().fill_(0.5));
         Agent::new(CavId::new("4279").unwrap(), Box::new(RecordedPose), Detector::from_network(pillars))
     }
@@ -219,7 +220,7 @@ mod tests {
     }
 
     #[test]
-    fn others_get_the_code_and_the_own_head_sees_what_they_will_make_of_it() {
+    fn neighbours_get_the_code_and_the_own_head_gets_what_they_decode() {
         let mut agent = agent_with(Some(4));
         let cloud = PointCloud { xyzi: (0..500).map(|k| [(k % 83) as f32 * 0.1 + 3.0, 0.5, -1.5, 0.2]).collect() };
         let encoded = agent.detector.encode(&cloud).unwrap().features;
@@ -233,7 +234,7 @@ mod tests {
     }
 
     #[test]
-    fn an_empty_sweep_without_a_pose_is_an_answer_too() {
+    fn an_empty_sweep_without_a_pose_gives_an_output_too() {
         let mut agent = agent();
         let input = AgentInput { capture_nanos: 0, cloud: &PointCloud::default(), measured_pose: None };
         let output = agent.process(&input).unwrap();

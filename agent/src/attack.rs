@@ -1,7 +1,8 @@
-//! A vehicle that lies, to find out what its lies do to others: off unless asked for.
+//! Attacks: an output filter that falsifies a vehicle's messages, to measure the effect on its neighbours. Off unless
+//! configured.
 //!
-//! Everything it says is sound by itself: right sizes, finite numbers, a pose that is one. Only what is told is not so.
-//! The same seed tells the same lies, offline and live.
+//! Every falsified message is well-formed: right sizes, finite numbers, a valid pose. Only its content is false.
+//! The same seed gives the same falsified messages, offline and live.
 
 use protocol::{BevFeatures, BevGrid, Box3d, CavId, Detection, PointCloud, Pose, PoseEstimate};
 use schemars::JsonSchema;
@@ -11,35 +12,36 @@ use support::random::SplitMix64;
 use crate::agent::Perception;
 use crate::output_filter::OutputFilter;
 
-/// Objects that are made up in every frame.
+/// Number of synthetic objects in every frame.
 const INVENTED: usize = 10;
-/// How far from itself a liar puts them, metres.
+/// Largest distance of a synthetic object from the attacker, metres.
 const INVENTED_WITHIN_M: f64 = 35.0;
-/// How much stronger it shows them than what is there.
-const LOUDER: f32 = 2.0;
-/// Half the edge of the piece of a map that a vehicle makes up, cells.
+/// Gain of the features of synthetic objects relative to those of real ones.
+const GAIN: f32 = 2.0;
+/// Half the edge of the patch of a feature map that is copied, cells.
 const PATCH_CELLS: i64 = 3;
 
-/// What a vehicle lies about.
+/// Kind of falsification.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema, clap::ValueEnum)]
 #[serde(rename_all = "snake_case")]
 #[value(rename_all = "snake_case")]
 pub enum Falsification {
-    /// Its pose is 5 to 30 m off, always by the same, and it is sure of it.
+    /// The pose is shifted by a constant offset of 5 to 30 m, with full confidence.
     ShiftedPose,
-    /// What it sees is noise of the same mean and spread as the truth.
+    /// The perception is noise with the mean and standard deviation of the true one.
     Noise,
-    /// What it sees is what another vehicle said, or where nobody is heard what it saw first, under its own pose.
+    /// The perception is a copy of another vehicle's messages, or of its own first frame if none is received, under its
+    /// own pose.
     Copied,
-    /// Beside what is there it sees ten vehicles that are not.
+    /// Ten vehicles that do not exist are added to the true perception.
     Invented,
 }
 
 impl Falsification {
-    /// Every lie, in the order of tables.
+    /// All kinds, in the order of tables.
     pub const ALL: [Self; 4] = [Self::ShiftedPose, Self::Noise, Self::Copied, Self::Invented];
 
-    /// The name in settings and tables.
+    /// Name in settings and tables.
     #[must_use]
     pub fn name(self) -> &'static str {
         match self {
@@ -51,16 +53,16 @@ impl Falsification {
     }
 }
 
-/// Who lies in an evaluation, and what about.
+/// Attackers of an evaluation and their falsification.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct AttackConfig {
-    /// What they lie about.
+    /// Kind of falsification.
     pub lie: Falsification,
-    /// How many: the first neighbours of every scenario.
+    /// Number of attackers: the first neighbours of every scenario.
     #[serde(default = "one")]
     pub liars: usize,
-    /// Same seed, same lies.
+    /// Seed of the falsification.
     #[serde(default)]
     pub seed: u64,
 }
@@ -70,37 +72,37 @@ fn one() -> usize {
 }
 
 impl AttackConfig {
-    /// The lies of the vehicle at `place` of its scenario, the ego being at 0; none where it is honest.
+    /// The attack of the vehicle at `place` of its scenario, the ego being at 0; none if it is honest.
     #[must_use]
     pub fn of(&self, place: usize, cav: &CavId) -> Option<Attack> {
         (1..=self.liars).contains(&place).then(|| Attack::new(self.lie, cav, self.seed))
     }
 }
 
-/// What a vehicle saw, as a copier repeats it.
+/// Captured perception of a vehicle, for replay by [`Falsification::Copied`].
 #[derive(Debug, Clone, Default)]
 pub struct CapturedMessages {
-    /// A map.
+    /// BEV feature map.
     pub features: Option<BevFeatures>,
-    /// Detections.
+    /// Detections, in the LiDAR frame of the captured vehicle.
     pub detections: Option<Vec<Detection>>,
-    /// Points.
+    /// Points, in the LiDAR frame of the captured vehicle.
     pub points: Option<PointCloud>,
 }
 
-/// A liar's state.
+/// State of an attacker.
 #[derive(Debug)]
 pub struct Attack {
     lie: Falsification,
     random: SplitMix64,
     offset_m: [f64; 2],
-    /// Where it puts what it makes up, in its own frame: x, y, heading.
+    /// Poses of the synthetic objects in the attacker's frame: x and y in metres, heading in radians.
     places: Vec<[f64; 3]>,
-    overheard: CapturedMessages,
+    captured: CapturedMessages,
 }
 
 impl Attack {
-    /// The lies that the vehicle `cav` tells under `seed`.
+    /// The attack of the vehicle `cav` under `seed`.
     #[must_use]
     pub fn new(lie: Falsification, cav: &CavId, seed: u64) -> Self {
         let letters: Vec<u64> = cav.as_str().bytes().map(u64::from).collect();
@@ -112,18 +114,18 @@ impl Attack {
         };
         let places = (0..INVENTED).map(|_| place(&mut random)).collect();
         let offset_m = [distance_m * direction.cos(), distance_m * direction.sin()];
-        tracing::warn!(%cav, lie = lie.name(), "this vehicle has been told to LIE to its neighbours");
-        Self { lie, random, offset_m, places, overheard: CapturedMessages::default() }
+        tracing::warn!(%cav, lie = lie.name(), "ATTACK: this vehicle falsifies its messages");
+        Self { lie, random, offset_m, places, captured: CapturedMessages::default() }
     }
 
-    /// Another vehicle's words, for [`Falsification::Copied`].
-    pub fn overhear(&mut self, overheard: CapturedMessages) {
+    /// Stores another vehicle's messages, for [`Falsification::Copied`].
+    pub fn overhear(&mut self, captured: CapturedMessages) {
         if self.lie == Falsification::Copied {
-            self.overheard = overheard;
+            self.captured = captured;
         }
     }
 
-    fn anything(&mut self) -> Detection {
+    fn random_detection(&mut self) -> Detection {
         let mut reach = || self.random.between(-INVENTED_WITHIN_M, INVENTED_WITHIN_M);
         let (x, y) = (reach(), reach());
         let heading = self.random.between(-3.1, 3.1);
@@ -132,7 +134,7 @@ impl Attack {
 }
 
 impl OutputFilter for Attack {
-    /// The pose it gives instead of its own.
+    /// The pose that is published instead of the vehicle's own.
     fn pose(&self, pose: PoseEstimate) -> PoseEstimate {
         let (Falsification::ShiftedPose, Some(own)) = (self.lie, pose.world_from_cav()) else { return pose };
         let [x, y, z] = own.translation_m;
@@ -140,32 +142,32 @@ impl OutputFilter for Attack {
         PoseEstimate::new(Pose { translation_m: [x + dx, y + dy, z], ..*own }, 1.0)
     }
 
-    /// What it says to see instead of what it does.
+    /// The perception that is published instead of the true one.
     fn perception(&mut self, truth: Perception) -> Perception {
-        let mut told = truth;
+        let mut falsified = truth;
         match self.lie {
             Falsification::ShiftedPose => {}
             Falsification::Noise => {
-                make_noise(&mut told.features, &mut self.random);
-                told.confidence.fill_with(|| self.random.unit() as f32);
-                told.detections = (0..2 * INVENTED).map(|_| self.anything()).collect();
+                make_noise(&mut falsified.features, &mut self.random);
+                falsified.confidence.fill_with(|| self.random.unit() as f32);
+                falsified.detections = (0..2 * INVENTED).map(|_| self.random_detection()).collect();
             }
             Falsification::Copied => {
-                let features = self.overheard.features.get_or_insert_with(|| told.features.clone());
-                if features.values.len() == told.features.values.len() {
-                    told.features = features.clone();
+                let features = self.captured.features.get_or_insert_with(|| falsified.features.clone());
+                if features.values.len() == falsified.features.values.len() {
+                    falsified.features = features.clone();
                 }
-                told.detections = self.overheard.detections.get_or_insert(told.detections).clone();
+                falsified.detections = self.captured.detections.get_or_insert(falsified.detections).clone();
             }
             Falsification::Invented => {
-                invent(&mut told.features, &mut told.confidence, &self.places);
-                told.detections.extend(self.places.iter().map(|&place| vehicle(place, 0.9)));
+                invent(&mut falsified.features, &mut falsified.confidence, &self.places);
+                falsified.detections.extend(self.places.iter().map(|&place| vehicle(place, 0.9)));
             }
         }
-        told
+        falsified
     }
 
-    /// The points it says to have measured instead of its own.
+    /// The points that are published instead of the measured ones.
     fn points(&mut self, truth: PointCloud) -> PointCloud {
         match self.lie {
             Falsification::ShiftedPose => truth,
@@ -177,19 +179,19 @@ impl OutputFilter for Attack {
                 };
                 PointCloud { xyzi: truth.xyzi.iter().map(any).collect() }
             }
-            Falsification::Copied => self.overheard.points.get_or_insert(truth).clone(),
+            Falsification::Copied => self.captured.points.get_or_insert(truth).clone(),
             Falsification::Invented => {
-                let mut told = truth;
+                let mut falsified = truth;
                 for &place in &self.places {
-                    points_of(place, &mut self.random, &mut told.xyzi);
+                    points_of(place, &mut self.random, &mut falsified.xyzi);
                 }
-                told
+                falsified
             }
         }
     }
 }
 
-/// A car that stands on the road there, for a sensor 1.9 m above it.
+/// A car on the road at this pose, for a sensor 1.9 m above it.
 fn vehicle([x, y, heading_rad]: [f64; 3], score: f32) -> Detection {
     Detection { box3d: Box3d { center_m: [x, y, -1.1], size_m: [4.4, 1.9, 1.6], heading_rad }, score, source: None }
 }
@@ -208,7 +210,7 @@ fn points_of([x, y, heading]: [f64; 3], random: &mut SplitMix64, points: &mut Ve
     }
 }
 
-/// Normal noise with the mean and the spread of each channel.
+/// Normal noise with the mean and the standard deviation of each channel.
 fn make_noise(features: &mut BevFeatures, random: &mut SplitMix64) {
     let cells = features.grid.cells().max(1);
     for channel in features.values.chunks_mut(cells) {
@@ -219,14 +221,14 @@ fn make_noise(features: &mut BevFeatures, random: &mut SplitMix64) {
     }
 }
 
-/// Puts what the map shows around its surest cell in other places, too, and more of it.
+/// Copies the features around the most confident cell to other positions, amplified.
 fn invent(features: &mut BevFeatures, confidence: &mut [f32], places: &[[f64; 3]]) {
     let BevGrid { width, height, .. } = features.grid;
     let (width, height) = (i64::from(width), i64::from(height));
     let cells = features.grid.cells();
-    let surest =
+    let most_confident =
         (confidence.iter().enumerate()).max_by(|one, other| one.1.total_cmp(other.1)).map(|(cell, _)| cell as i64);
-    let Some(from) = surest else { return };
+    let Some(from) = most_confident else { return };
     let (from_row, from_column) = (from / width.max(1), from % width.max(1));
     let (original, original_confidence) = (features.values.clone(), confidence.to_vec());
     let mean = |channel: &[f32]| channel.iter().sum::<f32>() / cells.max(1) as f32;
@@ -245,7 +247,7 @@ fn invent(features: &mut BevFeatures, confidence: &mut [f32], places: &[[f64; 3]
             confidence[target] = original_confidence[source];
             for (channel, mean) in means.iter().enumerate() {
                 let value = original[channel * cells + source];
-                features.values[channel * cells + target] = mean + LOUDER * (value - mean);
+                features.values[channel * cells + target] = mean + GAIN * (value - mean);
             }
         }
     }
@@ -269,36 +271,39 @@ mod tests {
     }
 
     #[test]
-    fn a_shifted_pose_is_off_by_the_same_every_time_and_sure_of_itself() {
+    fn a_shifted_pose_has_a_constant_offset_and_full_confidence() {
         let attack = Attack::new(Falsification::ShiftedPose, &cav("a"), 1);
-        let told = |x: f64| {
-            let told = attack.pose(PoseEstimate::new(Pose::from_xyz_yaw([x, 0.0, 0.0], 0.3), 0.4));
-            assert_eq!(told.confidence(), 1.0);
-            let pose = *told.world_from_cav().unwrap();
+        let falsified = |x: f64| {
+            let falsified = attack.pose(PoseEstimate::new(Pose::from_xyz_yaw([x, 0.0, 0.0], 0.3), 0.4));
+            assert_eq!(falsified.confidence(), 1.0);
+            let pose = *falsified.world_from_cav().unwrap();
             assert!(pose.validate().is_ok());
             [pose.translation_m[0] - x, pose.translation_m[1]]
         };
-        let [dx, dy] = told(10.0);
+        let [dx, dy] = falsified(10.0);
         assert!((5.0..=30.0).contains(&dx.hypot(dy)));
-        assert!((told(20.0)[0] - dx).abs() < 1e-9);
+        assert!((falsified(20.0)[0] - dx).abs() < 1e-9);
         let other = Attack::new(Falsification::ShiftedPose, &cav("b"), 1).offset_m;
-        assert!(other != attack.offset_m, "every liar has its own");
+        assert!(other != attack.offset_m, "every attacker has its own");
     }
 
     #[test]
-    fn what_is_told_has_the_shape_of_the_truth_and_other_values() {
+    fn falsified_output_has_the_shape_of_the_truth_and_other_values() {
         for lie in [Falsification::Noise, Falsification::Invented] {
-            let told = Attack::new(lie, &cav("a"), 1).perception(truth());
-            assert_eq!(told.features.values.len(), truth().features.values.len());
-            assert!(told.features.values != truth().features.values && !told.detections.is_empty(), "{lie:?}");
-            assert!(told.features.values.iter().all(|value| value.is_finite()));
+            let falsified = Attack::new(lie, &cav("a"), 1).perception(truth());
+            assert_eq!(falsified.features.values.len(), truth().features.values.len());
+            assert!(
+                falsified.features.values != truth().features.values && !falsified.detections.is_empty(),
+                "{lie:?}"
+            );
+            assert!(falsified.features.values.iter().all(|value| value.is_finite()));
         }
         let invented = Attack::new(Falsification::Invented, &cav("a"), 1).perception(truth());
         assert!(invented.confidence.iter().filter(|sure| **sure > 0.8).count() > 5);
     }
 
     #[test]
-    fn a_copier_repeats_what_it_heard_or_what_it_saw_first() {
+    fn copied_repeats_captured_messages_or_the_own_first_frame() {
         let mut attack = Attack::new(Falsification::Copied, &cav("a"), 1);
         let later = || {
             let mut later = truth();
@@ -307,8 +312,8 @@ mod tests {
         };
         assert_eq!(attack.perception(truth()).features, truth().features);
         assert_eq!(attack.perception(later()).features, truth().features);
-        let heard = CapturedMessages { features: Some(later().features), ..CapturedMessages::default() };
-        attack.overhear(heard);
+        let captured = CapturedMessages { features: Some(later().features), ..CapturedMessages::default() };
+        attack.overhear(captured);
         assert_eq!(attack.perception(truth()).features, later().features);
     }
 }

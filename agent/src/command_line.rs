@@ -12,7 +12,7 @@ use support::sibling_program::Forwarded;
 
 use crate::command;
 
-/// Program of the offline subcommands.
+/// Program that carries out the offline subcommands.
 const OFFLINE: &str = "agent-offline";
 
 /// Agent of one connected vehicle: localizes each LiDAR sweep, computes its BEV features and publishes both.
@@ -31,7 +31,7 @@ enum Command {
     Run(Box<command::run::Args>),
     /// Localize recorded sweeps and compare with their true poses
     Eval(Forwarded),
-    /// Localize recorded sweeps and keep their poses in a table
+    /// Localize recorded sweeps and write their poses to a table
     Localize(Forwarded),
     /// Train the networks of the localization
     Train(Forwarded),
@@ -42,7 +42,7 @@ impl Command {
         let offline = |forwarded: Forwarded, name| -> io::Result<()> { Err(forwarded.exec(OFFLINE, name)) };
         match self {
             Self::Run(args) => {
-                malloc_settings::ensure(&malloc_settings::KEPT_MEMORY).context("this program again")?;
+                malloc_settings::ensure(&malloc_settings::KEPT_MEMORY).context("cannot execute this program again")?;
                 command::run::run(*args)
             }
             Self::Eval(forwarded) => Ok(offline(forwarded, "eval")?),
@@ -52,7 +52,7 @@ impl Command {
     }
 }
 
-/// RunScope a subcommand.
+/// Runs a subcommand.
 pub(crate) fn run(cli: Cli) -> ExitCode {
     exit_code(cli.command.run().map(|()| Outcome::Done), BusError::is_behind)
 }

@@ -25,15 +25,15 @@ pub struct AgentConfig {
     /// The vehicle.
     #[arg(long, required_unless_present = "config", allow_hyphen_values = true)]
     pub cav: CavId,
-    /// Messages to send beside the pose.
+    /// Messages to publish beside the pose.
     #[arg(long, value_enum, value_delimiter = ',')]
     #[serde(default = "Publish::maps")]
     pub publish: Vec<Publish>,
-    /// Go on when the replay ends, for the next one; always so with `supervised`.
+    /// Keep running when the replay ends, for the next one; always so with `supervised`.
     #[arg(long)]
     #[serde(default)]
     pub keep_running: bool,
-    /// Note in this file when each sweep came: capture time and arrival, nanoseconds.
+    /// Log of the arrival of each sweep: capture time and arrival, nanoseconds.
     #[arg(long, value_name = "FILE")]
     #[serde(default)]
     pub sweep_log: Option<PathBuf>,
@@ -50,14 +50,14 @@ pub struct AgentConfig {
     pub bus: BusConfig,
 }
 
-/// Detector of a process, and the threads that it computes with.
+/// Detector of a process and its number of threads.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema, clap::Args)]
 #[serde(deny_unknown_fields)]
 pub struct ModelConfig {
     /// Weights of the detector (safetensors; its configuration is inside).
     #[arg(long, value_name = "FILE", required_unless_present = "config")]
     pub weights: PathBuf,
-    /// Threads to compute with, 1 to 256; the same number gives the same bits.
+    /// Threads that libtorch computes with, 1 to 256; the same number gives the same bits.
     #[arg(long)]
     #[serde(default)]
     pub threads: Threads,
@@ -76,7 +76,7 @@ pub struct AgentSettings {
     /// Rate control of feature maps: a size, a byte rate, the vehicle's own queue.
     #[command(flatten)]
     pub rate: RateConfig,
-    /// Falsification of the vehicle's messages, to measure what it does to the ego. Absent: none.
+    /// Falsification of the vehicle's messages, to measure its effect on the ego. Absent: none.
     #[arg(long, value_enum, help_heading = "Attack")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub lie: Option<Falsification>,
@@ -88,7 +88,7 @@ pub struct AgentSettings {
 pub enum Publish {
     /// BEV feature maps.
     Bev,
-    /// Detections of this vehicle alone.
+    /// Detections of this vehicle by itself.
     Boxes,
     /// Points, for the early-fusion baseline.
     Points,
@@ -130,12 +130,12 @@ impl FromStr for Threads {
 }
 
 impl Threads {
-    /// Makes libtorch compute with as many.
+    /// Sets the number of threads of libtorch.
     pub fn apply(self) {
         tch::set_num_threads(i32::from(self.0));
     }
 
-    /// Checks the number.
+    /// Checks the range.
     ///
     /// # Errors
     /// [`FieldError`] for a number outside of 1 to 256.
@@ -148,7 +148,7 @@ impl AgentSettings {
     /// Checks the values.
     ///
     /// # Errors
-    /// [`FieldError`] for the first that is not allowed.
+    /// [`FieldError`] of the first value that is out of range.
     pub fn validate(&self) -> Result<(), FieldError> {
         self.pose.validate()?;
         within("codec.zstd_level", self.codec.zstd_level.unwrap_or(1), 1, 22)
@@ -166,7 +166,7 @@ impl ProcessConfig for AgentConfig {
 }
 
 impl AgentConfig {
-    /// The same as the agent's node takes it.
+    /// Options of the agent's node.
     #[must_use]
     pub fn options(&self) -> NodeOptions {
         NodeOptions {

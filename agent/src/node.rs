@@ -1,7 +1,7 @@
-//! An agent on the bus: its vehicle's sensors in; pose, map, boxes or points out.
+//! Agent on the bus: subscribes to its vehicle's sensors; publishes pose, BEV feature map, boxes or points.
 //!
-//! It subscribes to the sensors of its own vehicle and to nothing else; the truth in particular it cannot see. One
-//! thread receives, computes and offers; encoding and sending have threads of their own.
+//! It subscribes to the sensors of its own vehicle only; access control keeps the ground truth from it. One thread
+//! receives, computes and submits; encoding and sending have threads of their own.
 
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -21,32 +21,32 @@ use crate::rate::{RateConfig, RateControl, Turn};
 use crate::sweep_log::SweepLog;
 use crate::sweep_pairing::{PairedSweep, SweepPairing};
 
-/// How long a sweep waits for its pose, which was sent before it.
-const POSE_PATIENCE: Duration = Duration::from_millis(200);
+/// Longest time that a sweep waits for its pose, which was sent before it.
+const POSE_TIMEOUT: Duration = Duration::from_millis(200);
 /// Poses that may wait in the inbox while a sweep is computed.
-const POSE_PLACES: usize = 32;
-/// How often an agent says what it is going to send, for those that join late.
+const POSE_SLOTS: usize = 32;
+/// Period at which an agent publishes its descriptor, for processes that join late.
 const DESCRIPTOR_PERIOD: Duration = Duration::from_secs(1);
 
-/// How an agent takes part.
+/// Options of an agent's node.
 #[derive(Debug, Clone)]
 pub struct NodeOptions {
-    /// What it sends beside its pose: any of [`Stream::Bev`], [`Stream::Boxes`] and [`Stream::Points`].
+    /// Streams beside the pose: any of [`Stream::Bev`], [`Stream::Boxes`] and [`Stream::Points`].
     pub publish: Vec<Stream>,
-    /// How it writes its maps.
+    /// Codec of feature maps.
     pub codec: CodecConfig,
-    /// How it fits them to what the air takes.
+    /// Rate control of feature maps.
     pub rate: RateConfig,
-    /// Whether to go on when the replay has ended, for the next one.
+    /// True to keep running when the replay has ended, for the next one.
     pub keeps_running: bool,
-    /// What it takes from the bus.
+    /// Limits of incoming messages.
     pub limits: Limits,
-    /// Where it notes when each sweep came, if anywhere.
+    /// Log of the arrival of sweeps, if configured.
     pub sweep_log: Option<PathBuf>,
 }
 
 impl Default for NodeOptions {
-    /// Maps, `f32`, dense.
+    /// Feature maps as `f32`, dense.
     fn default() -> Self {
         Self {
             publish: vec![Stream::Bev],
@@ -59,7 +59,7 @@ impl Default for NodeOptions {
     }
 }
 
-/// What an agent did.
+/// Counters of an agent at its end.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize)]
 pub struct NodeReport {
     /// Sweeps computed.
@@ -68,14 +68,14 @@ pub struct NodeReport {
     pub no_pose: u64,
     /// Sweeps that could not be computed.
     pub failed: u64,
-    /// Poses that the vehicle cannot have driven to from those before; they go out with little confidence.
+    /// Poses that the vehicle cannot have reached from the previous ones; they are published with little confidence.
     pub pose_jumps: u64,
 }
 
-/// RunScope `agent` on the calling thread until the replay ends or `stop` is requested.
+/// Runs `agent` on the calling thread until the replay ends or `stop` is requested.
 ///
 /// # Errors
-/// [`BusError`] when the bus refuses. What goes wrong with single messages is counted and logged.
+/// [`BusError`] if the bus fails. Errors of single messages are counted and logged.
 pub fn run(bus: &Bus, agent: Agent, options: &NodeOptions, stop: &Stop) -> Result<NodeReport, BusError> {
     run_filtered(bus, agent, Box::new(Unfiltered), options, stop)
 }
@@ -94,8 +94,8 @@ pub fn run_filtered(
     let mut node = Node::open(bus, agent, filter, options, stop)?;
     let presence = bus.announce(Role::Agent)?;
     node.listen(stop);
-    let Node { outlet, report, .. } = node;
-    outlet.finish();
+    let Node { publishers, report, .. } = node;
+    publishers.finish();
     presence.withdraw()?;
     Ok(report)
 }
@@ -109,7 +109,7 @@ struct Node<'a> {
     lidar: Topic,
     gnss: Topic,
     pairing: SweepPairing<Arrival>,
-    outlet: Outlet,
+    publishers: Publishers,
     report: NodeReport,
     sweep_log: Option<SweepLog>,
     _subscriptions: [Subscription; 2],
@@ -125,19 +125,19 @@ impl<'a> Node<'a> {
     ) -> Result<Self, BusError> {
         let topic = |stream| Topic::Stream { cav: agent.cav().clone(), stream };
         let (lidar, gnss) = (topic(Stream::Lidar), topic(Stream::Gnss));
-        // One place: while a sweep is computed only the newest of those that come is worth keeping.
+        // One slot: while a sweep is computed only the newest of those that arrive is kept.
         let inbox = bus.inbox(1, 2);
         stop.on_request({
             let inbox = Arc::clone(&inbox);
             move || inbox.close()
         });
-        let outlet = Outlet::open(bus, &agent, options)?;
+        let publishers = Publishers::open(bus, &agent, options)?;
         let subscriptions =
-            [bus.subscribe_keeping(gnss.clone(), POSE_PLACES, &inbox)?, bus.subscribe(lidar.clone(), &inbox)?];
-        let pairing = SweepPairing::new(POSE_PATIENCE);
+            [bus.subscribe_keeping(gnss.clone(), POSE_SLOTS, &inbox)?, bus.subscribe(lidar.clone(), &inbox)?];
+        let pairing = SweepPairing::new(POSE_TIMEOUT);
         let sweep_log = options.sweep_log.as_deref().map(SweepLog::open).transpose();
         let sweep_log = sweep_log.unwrap_or_else(|error| {
-            tracing::warn!("when sweeps come is not noted: {error}");
+            tracing::warn!("arrivals of sweeps are not logged: {error}");
             None
         });
         Ok(Self {
@@ -149,7 +149,7 @@ impl<'a> Node<'a> {
             lidar,
             gnss,
             pairing,
-            outlet,
+            publishers,
             report: NodeReport::default(),
             sweep_log,
             _subscriptions: subscriptions,
@@ -159,13 +159,13 @@ impl<'a> Node<'a> {
     fn listen(&mut self, stop: &Stop) {
         let _working = self.bus.works_from(&self.inbox);
         while !stop.requested() {
-            self.outlet.describe();
-            let deadline = self.pairing.deadline().unwrap_or(self.outlet.next_descriptor);
-            match self.inbox.take(Some(deadline.min(self.outlet.next_descriptor))) {
+            self.publishers.describe();
+            let deadline = self.pairing.deadline().unwrap_or(self.publishers.next_descriptor);
+            match self.inbox.take(Some(deadline.min(self.publishers.next_descriptor))) {
                 Pop::Item(_, Event::Message(arrival)) => self.admit(arrival),
                 Pop::Item(topic, Event::End { .. }) if topic == self.lidar && !self.options.keeps_running => {
-                    // Whatever still waits for a pose has waited long enough.
-                    self.advance(Instant::now() + POSE_PATIENCE);
+                    // Everything that still waits for a pose has waited for the time-out.
+                    self.advance(Instant::now() + POSE_TIMEOUT);
                     return;
                 }
                 Pop::Item(_, Event::End { .. }) | Pop::TimedOut => {}
@@ -205,9 +205,9 @@ impl<'a> Node<'a> {
             self.bus.books().received(&self.lidar);
             let arrived_nanos = unix_nanos().saturating_sub(nanos::of(sweep.at.elapsed()));
             self.process(&AgentInput { capture_nanos, cloud: &points, measured_pose: pose.as_ref() });
-            // When everything is on its way.
+            // Logged after everything is submitted.
             if let Some(Err(error)) = self.sweep_log.as_mut().map(|log| log.note(capture_nanos, arrived_nanos)) {
-                tracing::warn!("when sweeps come is not noted any more: {error}");
+                tracing::warn!("arrivals of sweeps are no longer logged: {error}");
                 self.sweep_log = None;
             }
         }
@@ -218,7 +218,7 @@ impl<'a> Node<'a> {
         let began = Instant::now();
         let pose = self.filter.pose(self.agent.estimate_pose(input));
         books.timed("pose", began.elapsed());
-        self.outlet.pose.offer(input.capture_nanos, pose);
+        self.publishers.pose.offer(input.capture_nanos, pose);
         for stage in self.agent.pose_stages() {
             books.timed(&stage.stage, Duration::from_nanos(stage.nanos));
         }
@@ -232,20 +232,20 @@ impl<'a> Node<'a> {
                 books.timed("agent", began.elapsed());
                 self.report.sweeps += 1;
                 let perception = self.filter.perception(perception);
-                let shared = self.outlet.points.is_some().then(|| self.agent.share_points(input.cloud));
+                let shared = self.publishers.points.is_some().then(|| self.agent.share_points(input.cloud));
                 let shared = shared.map(|points| self.filter.points(points));
-                self.outlet.offer(input, pose, perception, shared, books);
+                self.publishers.offer(input, pose, perception, shared, books);
             }
             Err(error) => {
                 self.report.failed += 1;
-                tracing::error!(capture_nanos = input.capture_nanos, "a sweep could not be computed: {error}");
+                tracing::error!(capture_nanos = input.capture_nanos, "cannot compute a sweep: {error}");
             }
         }
     }
 }
 
-/// Everything an agent publishes.
-struct Outlet {
+/// Publishers of an agent.
+struct Publishers {
     pose: Publisher,
     bev: Option<Publisher>,
     boxes: Option<Publisher>,
@@ -254,13 +254,13 @@ struct Outlet {
     codec: CodecConfig,
     /// Shared with the sending thread, which is where maps are written.
     rate: Arc<Mutex<RateControl>>,
-    /// Maps offered so far.
-    offered: u64,
+    /// Feature maps submitted so far.
+    submitted: u64,
     description: Descriptor,
     next_descriptor: Instant,
 }
 
-impl Outlet {
+impl Publishers {
     fn open(bus: &Bus, agent: &Agent, options: &NodeOptions) -> Result<Self, BusError> {
         let publisher = |stream, how| bus.publisher(Topic::Stream { cav: agent.cav().clone(), stream }, how);
         let wanted = |stream| {
@@ -282,7 +282,7 @@ impl Outlet {
             descriptor: publisher(Stream::Descriptor, PublisherOptions::POSE)?,
             codec: options.codec,
             rate: Arc::new(Mutex::new(RateControl::new(options.rate))),
-            offered: 0,
+            submitted: 0,
             description,
             next_descriptor: Instant::now(),
         })
@@ -307,9 +307,10 @@ impl Outlet {
         let Perception { features, confidence, detections, .. } = perception;
         if let Some(bev) = &self.bev {
             let (codec, rate, books, topic) = (self.codec, Arc::clone(&self.rate), books.clone(), bev.topic().clone());
-            let (number, offered, capture_nanos) = (self.offered, Instant::now(), input.capture_nanos);
-            self.offered += 1;
-            // Choosing, selecting, quantising and packing happen on the sending thread, when it is the map's turn.
+            let (number, offered, capture_nanos) = (self.submitted, Instant::now(), input.capture_nanos);
+            self.submitted += 1;
+            // The choice of format, selection, quantisation and compression run on the sending thread, at the map's
+            // turn.
             bev.offer_encoded(capture_nanos, move |stamp| {
                 let turn = Turn { number, offered, begun: Instant::now() };
                 let mut rate = rate.lock().unwrap_or_else(PoisonError::into_inner);

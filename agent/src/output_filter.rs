@@ -1,17 +1,17 @@
-//! Output filter: a stage between an agent and what its node publishes.
+//! Output filter: a stage between an agent and the output that its node publishes.
 
 use protocol::{PointCloud, PoseEstimate};
 
 use crate::agent::Perception;
 
-/// Changes what an agent computed before it is published. Each part passes unchanged unless a filter says otherwise.
+/// Changes the output of an agent before it is published. By default each part passes unchanged.
 pub trait OutputFilter: std::fmt::Debug + Send {
     /// The published pose.
     fn pose(&self, pose: PoseEstimate) -> PoseEstimate {
         pose
     }
 
-    /// The published map, confidence and detections.
+    /// The published feature map, confidence and detections.
     fn perception(&mut self, perception: Perception) -> Perception {
         perception
     }
@@ -22,7 +22,7 @@ pub trait OutputFilter: std::fmt::Debug + Send {
     }
 }
 
-/// Publishes what the agent computed.
+/// Publishes the output unchanged.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Unfiltered;
 

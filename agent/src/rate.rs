@@ -1,10 +1,11 @@
-//! How large a map may be: what the air takes, or what an agent's own queue lets through.
+//! Rate control of feature maps: fits their size to a configured rate or to the measured throughput of the agent's
+//! queue.
 //!
-//! A map that does not leave before the next one is offered is lost to it: a slot that keeps the newest stands before every
-//! publisher. A smaller map that arrives is worth more than a whole one that does not, so an agent can be told to keep
-//! within a size or a byte rate, or to find out by itself from how long its maps wait for their turn. What gives way is
-//! decided in [`protocol::codec::encode_within`]: first the numbers get coarser, then the least confident cells are left
-//! out.
+//! A feature map that has not left before the next one is submitted is superseded: a KEEP_LAST(1) queue stands before
+//! every publisher. A smaller map that arrives is worth more than a full one that does not, so an agent can keep within
+//! a size or a byte rate, or measure from the waiting times of its maps how much its queue lets through. The order of
+//! reduction is defined in [`protocol::codec::encode_within`]: first a coarser number format, then the least confident
+//! cells are left out.
 
 use std::time::{Duration, Instant};
 
@@ -13,46 +14,47 @@ use protocol::{BevFeatures, ByteLimit, CodecConfig, EncodedFeatures, LimitedBy, 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// Longest that a message may occupy the air at a byte rate, nanoseconds: the period of a LiDAR. More would arrive later than
-/// the map after it could have.
-const LONGEST_ON_AIR_NANOS: u64 = 100_000_000;
+/// Longest transmission time of a message at a byte rate, nanoseconds: the period of a LiDAR. With a longer one it
+/// would arrive later than the map after it could have.
+const LONGEST_TRANSMISSION_NANOS: u64 = 100_000_000;
 /// Share of the time between two maps that one may wait for its turn before the queue counts as blocked.
-const PATIENCE: f64 = 0.25;
-/// Share of what went through while the queue was blocked that is tried next: below one, so that the queue empties.
+const BLOCKED_SHARE: f64 = 0.25;
+/// Share of the throughput of the blocked queue that is tried next: below one, so that the queue empties.
 const BACK_OFF: f64 = 0.8;
 /// Growth from map to map while the queue is free.
 const GROWTH: f64 = 1.1;
-/// However blocked the queue, this share of the largest message is tried.
+/// Smallest share of the largest message that is tried, however blocked the queue is.
 const SMALLEST_SHARE: f64 = 1.0 / 128.0;
 
-/// Limits that feature maps are fitted to: first in a coarser number format, then with fewer cells, the most confident ones.
+/// Limits that feature maps are fitted to: first in a coarser number format, then with fewer cells, the most confident
+/// ones.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema, clap::Args)]
 #[serde(default, deny_unknown_fields)]
 #[command(next_help_heading = "Rate control of feature maps")]
 pub struct RateConfig {
-    /// Most bytes of a message with a map, header and metadata included. Absent: any size.
+    /// Largest message with a feature map, bytes, header and metadata included. Absent: any size.
     #[arg(long, value_name = "BYTES")]
     pub message_bytes: Option<u64>,
-    /// Most bytes per second of such messages, each of which may take up to 100 ms of them. Absent: any.
+    /// Highest rate of such messages, bytes per second; each may take up to 100 ms of it. Absent: any.
     #[arg(long, value_name = "BYTES")]
     pub bytes_per_second: Option<u64>,
-    /// Send less while maps wait for earlier ones to leave, and more again when they do not.
+    /// Reduce the size while feature maps wait for earlier ones to leave, and increase it again when they do not.
     #[arg(long)]
     pub watch_queue: bool,
 }
 
-/// A map whose turn to be sent has come.
+/// Turn of a feature map at the head of the sending queue.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Turn {
-    /// How many maps were offered before it. Those between the last turn and this one were superseded.
+    /// Number of maps submitted before it. Those between the last turn and this one were superseded.
     pub number: u64,
-    /// When it was offered.
+    /// Time of submission.
     pub offered: Instant,
-    /// When those before it had left.
+    /// Time at which the messages before it had left.
     pub begun: Instant,
 }
 
-/// Decides map by map, from the past ones.
+/// Limits the size of each map, given the past ones.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct RateControl {
     config: RateConfig,
@@ -62,14 +64,14 @@ pub struct RateControl {
 }
 
 impl RateControl {
-    /// Nothing was sent yet.
+    /// State before the first map.
     #[must_use]
     pub fn new(config: RateConfig) -> Self {
         Self { config, ..Self::default() }
     }
 
-    /// Encodes a map as `codec` wants it, or smaller where it has to be; the message says which and why. `turn` is known
-    /// where there is a queue. Calls follow each other in the order of sending.
+    /// Encodes a feature map as `codec` specifies, or smaller if a limit requires it; the message records format and
+    /// reason. `turn` is known if there is a queue. Calls follow each other in the order of sending.
     ///
     /// # Errors
     /// As [`encode_within`].
@@ -89,7 +91,7 @@ impl RateControl {
         Ok(encoded)
     }
 
-    /// The tightest of all limits; nothing where there is none.
+    /// The tightest of all limits; none if there is no limit.
     fn limit(
         &mut self,
         features: &BevFeatures,
@@ -112,42 +114,42 @@ impl RateControl {
         Ok([size, rate, queue].into_iter().flatten().min_by_key(|limit| limit.bytes))
     }
 
-    /// The time of the air that belongs to a map; also where the clock of the scene jumps.
+    /// The transmission time that belongs to a map; also where the clock of the scene jumps.
     fn nanos_since_last(&mut self, capture_nanos: u64) -> u64 {
         let last = self.last_capture_nanos.replace(capture_nanos);
         let since = last.and_then(|last| capture_nanos.checked_sub(last)).filter(|nanos| *nanos > 0);
-        since.map_or(LONGEST_ON_AIR_NANOS, |nanos| nanos.min(LONGEST_ON_AIR_NANOS))
+        since.map_or(LONGEST_TRANSMISSION_NANOS, |nanos| nanos.min(LONGEST_TRANSMISSION_NANOS))
     }
 }
 
-/// What `bytes_per_second` come to in some nanoseconds.
+/// Number of bytes that `bytes_per_second` allows in some nanoseconds.
 fn bytes_within(bytes_per_second: u64, nanos: u64) -> u64 {
     let bytes = u128::from(bytes_per_second) * u128::from(nanos) / 1_000_000_000;
     u64::try_from(bytes).unwrap_or(u64::MAX)
 }
 
-/// Finds out what the own queue lets through.
+/// Estimates the throughput of the agent's own queue.
 ///
-/// While a map waits, the time from the last one's turn to its own is the time that the last one took to leave: what went
-/// through in it, less a reserve, is tried next. While none waits, the size grows until maps are whole again.
+/// While a map waits, the time from the last one's turn to its own is the time that the last one took to leave: the
+/// throughput of that time, less a reserve, is tried next. While none waits, the size grows until maps are full again.
 #[derive(Debug, Clone, PartialEq, Default)]
 struct QueueWatch {
     last: Option<Turn>,
-    /// Of the last message.
+    /// Size of the last message, bytes.
     last_bytes: u64,
-    /// What was allowed last; nothing while maps are whole.
+    /// Last limit, bytes; none while maps are full.
     allowed: Option<f64>,
 }
 
 impl QueueWatch {
-    /// Bytes that the next message may have.
+    /// Largest size of the next message, bytes.
     fn allow(&mut self, turn: &Turn, smallest: u64, largest: u64) -> u64 {
         let floor = (largest as f64 * SMALLEST_SHARE).max(2.0 * smallest as f64);
         if let Some(last) = self.last.replace(*turn) {
             let offers = turn.number.saturating_sub(last.number).max(1);
             let period = turn.offered.saturating_duration_since(last.offered).div_f64(offers as f64);
             let waited = turn.begun.saturating_duration_since(turn.offered);
-            self.allowed = if offers > 1 || waited > period.mul_f64(PATIENCE) {
+            self.allowed = if offers > 1 || waited > period.mul_f64(BLOCKED_SHARE) {
                 let took = turn.begun.saturating_duration_since(last.begun);
                 Some(self.backed_off(period, took).max(floor))
             } else {
@@ -172,8 +174,8 @@ mod tests {
 
     const GRID: BevGrid = BevGrid { x_min_m: -25.6, y_min_m: -19.2, cell_m: 0.8, width: 64, height: 48 };
     const CHANNELS: u32 = 16;
-    /// `[16, 48, 64]` as `f32`.
-    const WHOLE_BYTES: u64 = 4 * 16 * 48 * 64;
+    /// Size of a map `[16, 48, 64]` as `f32`.
+    const FULL_BYTES: u64 = 4 * 16 * 48 * 64;
 
     fn map() -> (BevFeatures, Vec<f32>) {
         let values = (0..CHANNELS as usize * GRID.cells()).map(|n| (n as f32 * 0.31).cos()).collect();
@@ -186,8 +188,8 @@ mod tests {
         control.encode(features, &CodecConfig::default(), &confidence, capture_nanos, turn).unwrap()
     }
 
-    /// Maps at 10 Hz over a sender that takes `bytes_per_second(second)`; each sent one with how long it waited.
-    struct Road {
+    /// Maps at 10 Hz over a sender that takes `bytes_per_second(second)`; each sent one with its waiting time.
+    struct SlowLink {
         control: RateControl,
         start: Instant,
         free: Instant,
@@ -195,14 +197,14 @@ mod tests {
         waiting: Option<(u64, Instant)>,
     }
 
-    impl Road {
+    impl SlowLink {
         fn new() -> Self {
             let control = RateControl::new(RateConfig { watch_queue: true, ..RateConfig::default() });
             let start = Instant::now();
             Self { control, start, free: start, number: 0, waiting: None }
         }
 
-        /// Drives on for `frames`; sizes and waits of the maps that were sent, and how many were superseded.
+        /// Runs `frames` more; sizes and waiting times of the maps that were sent, and the number that was superseded.
         fn drive(&mut self, frames: u64, bytes_per_second: f64) -> (Vec<(u64, Duration)>, u64) {
             let (mut sent, mut superseded) = (Vec::new(), 0);
             for _ in 0..frames {
@@ -244,7 +246,7 @@ mod tests {
         let limits: Vec<u64> = [500, 550, 650, 5000, 100]
             .map(|ms: u64| encode(&mut control, ms * 1_000_000, None).rate.unwrap().limit_bytes)
             .into();
-        // The first has a period to itself, a later one what has passed, none more than a period; a scene may start anew.
+        // The first has a full period, a later one the time passed, none more than a period; a scene may restart.
         assert_eq!(limits, [100_000, 50_000, 100_000, 100_000, 100_000]);
     }
 
@@ -261,38 +263,38 @@ mod tests {
     }
 
     #[test]
-    fn a_slow_link_makes_maps_smaller_and_a_fast_one_whole_again() {
-        let mut road = Road::new();
-        let (sent, superseded) = road.drive(20, 20e6);
-        assert!(superseded == 0 && sent.iter().all(|(bytes, _)| *bytes == WHOLE_BYTES + HEAD_BYTES), "{sent:?}");
+    fn a_slow_link_makes_maps_smaller_and_a_fast_one_full_again() {
+        let mut link = SlowLink::new();
+        let (sent, superseded) = link.drive(20, 20e6);
+        assert!(superseded == 0 && sent.iter().all(|(bytes, _)| *bytes == FULL_BYTES + HEAD_BYTES), "{sent:?}");
 
-        // 200 kB a second: 20 kB a period, a tenth of a whole map.
-        let (sent, superseded) = road.drive(100, 200e3);
-        // The last whole map takes a second to leave, and none is lost after it.
+        // 200 kB a second: 20 kB a period, a tenth of a full map.
+        let (sent, superseded) = link.drive(100, 200e3);
+        // The last full map takes a second to leave, and none is lost after it.
         assert!((5..12).contains(&superseded), "{superseded}");
         let settled = &sent[20..];
         let mean = settled.iter().map(|(bytes, _)| *bytes).sum::<u64>() / settled.len() as u64;
         assert!((14_000..21_000).contains(&mean), "{mean}");
         assert!(settled.iter().all(|(_, waited)| *waited < Duration::from_millis(80)), "{settled:?}");
 
-        let (sent, superseded) = road.drive(60, 20e6);
+        let (sent, superseded) = link.drive(60, 20e6);
         assert_eq!(superseded, 0);
-        assert_eq!(sent.last().unwrap().0, WHOLE_BYTES + HEAD_BYTES);
-        // Not at once: what the link takes is found out step by step.
-        assert!(sent[5].0 < WHOLE_BYTES / 2, "{sent:?}");
+        assert_eq!(sent.last().unwrap().0, FULL_BYTES + HEAD_BYTES);
+        // Not at once: the throughput is estimated step by step.
+        assert!(sent[5].0 < FULL_BYTES / 2, "{sent:?}");
     }
 
     #[test]
     fn a_link_that_takes_nothing_is_still_tried() {
-        let mut road = Road::new();
-        let (sent, _) = road.drive(600, 20e3);
+        let mut link = SlowLink::new();
+        let (sent, _) = link.drive(600, 20e3);
         let smallest = sent.iter().map(|(bytes, _)| *bytes).min().unwrap();
-        assert!(smallest > WHOLE_BYTES / 150 && smallest < WHOLE_BYTES / 50, "{smallest}");
+        assert!(smallest > FULL_BYTES / 150 && smallest < FULL_BYTES / 50, "{smallest}");
     }
 
     #[test]
     fn the_same_past_gives_the_same_choice() {
-        let drive = || Road::new().drive(80, 300e3);
+        let drive = || SlowLink::new().drive(80, 300e3);
         assert_eq!(
             drive().0.iter().map(|(b, _)| *b).collect::<Vec<_>>(),
             drive().0.iter().map(|(b, _)| *b).collect::<Vec<_>>()

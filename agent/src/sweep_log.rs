@@ -1,4 +1,4 @@
-//! When each sweep reached an agent: the one moment on the way from capture to detections of which no message tells.
+//! Sweep log: the arrival of each sweep at an agent, the one time from capture to detections that no message carries.
 //!
 //! One line per sweep: its capture time on the scene's clock and its arrival on the Unix clock, both in nanoseconds.
 
@@ -7,35 +7,35 @@ use std::fs::{File, OpenOptions};
 use std::io::{self, BufRead, BufReader, Read, Write};
 use std::path::Path;
 
-/// Longer files are read no further: at 10 Hz this is two weeks.
+/// Largest part of a file that is read, bytes: at 10 Hz this is two weeks.
 const MOST_BYTES: u64 = 512 << 20;
 
-/// The file as an agent writes it.
+/// Writer of a sweep log.
 #[derive(Debug)]
 pub struct SweepLog(File);
 
 impl SweepLog {
-    /// Opens the file, to go on at its end.
+    /// Opens the file to append to it.
     ///
     /// # Errors
-    /// When it cannot be written.
+    /// The system's, if the file cannot be written.
     pub fn open(path: &Path) -> io::Result<Self> {
         OpenOptions::new().create(true).append(true).open(path).map(Self)
     }
 
-    /// Notes a sweep.
+    /// Appends a sweep.
     ///
     /// # Errors
-    /// When the file cannot be written.
+    /// The system's, if the file cannot be written.
     pub fn note(&mut self, capture_nanos: u64, arrived_nanos: u64) -> io::Result<()> {
         self.0.write_all(format!("{capture_nanos},{arrived_nanos}\n").as_bytes())
     }
 }
 
-/// Arrival of every sweep in the file, by capture time. What is no such line, for example one that was cut, is left out.
+/// Arrival of every sweep in the file, by capture time. Invalid lines, for example a truncated one, are left out.
 ///
 /// # Errors
-/// When the file cannot be read.
+/// The system's, if the file cannot be read.
 pub fn read(path: &Path) -> io::Result<BTreeMap<u64, u64>> {
     let mut arrived = BTreeMap::new();
     for line in BufReader::new(File::open(path)?.take(MOST_BYTES)).lines() {
@@ -53,7 +53,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_log_is_continued_and_read_without_what_was_cut() {
+    fn a_log_is_continued_and_read_without_truncated_lines() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("sweeps.csv");
         assert!(read(&path).is_err());

@@ -1,4 +1,4 @@
-//! Which measured pose belongs to which sweep: the one of the same capture time.
+//! Sweep pairing: matches each sweep with the measured pose of the same capture time.
 
 use std::collections::BTreeMap;
 use std::ops::Bound;
@@ -6,10 +6,10 @@ use std::time::{Duration, Instant};
 
 use protocol::Pose;
 
-/// Poses kept for sweeps that have not come: at 10 Hz three seconds.
+/// Poses kept for sweeps that have not arrived: at 10 Hz three seconds.
 const MAX_POSES: usize = 32;
 
-/// A sweep and its pose, if that has come.
+/// A sweep and its pose, if that has arrived.
 #[derive(Debug, PartialEq)]
 pub struct PairedSweep<S> {
     /// Capture time, nanoseconds.
@@ -20,7 +20,7 @@ pub struct PairedSweep<S> {
     pub pose: Option<Pose>,
 }
 
-/// Holds the newest sweep until its pose comes, or is known not to.
+/// Holds the newest sweep until its pose arrives, or is known to be lost.
 #[derive(Debug)]
 pub struct SweepPairing<S> {
     patience: Duration,
@@ -29,14 +29,14 @@ pub struct SweepPairing<S> {
 }
 
 impl<S> SweepPairing<S> {
-    /// Waits at most `patience` for the pose of a sweep.
+    /// Pairing with at most `patience` of waiting for the pose of a sweep.
     #[must_use]
     pub fn new(patience: Duration) -> Self {
         Self { patience, waiting: None, poses: BTreeMap::new() }
     }
 
-    /// A pose has come. Returns how many others had to go: the oldest where there are too many, and those of later sweeps.
-    /// Poses come in order, so a later one is left over from before the scene began anew.
+    /// Adds a pose. Returns how many others were dropped: the oldest if there are too many, and those of later sweeps.
+    /// Poses arrive in order, so a later one is left over from before the scene restarted.
     #[must_use]
     pub fn add_pose(&mut self, capture_nanos: u64, pose: Pose) -> usize {
         let left_over = self.take_later(capture_nanos).len();
@@ -48,23 +48,23 @@ impl<S> SweepPairing<S> {
         left_over + replaced + too_many
     }
 
-    /// Takes out the poses of later sweeps.
+    /// Removes the poses of later sweeps.
     fn take_later(&mut self, capture_nanos: u64) -> BTreeMap<u64, Pose> {
-        // Nothing is later than the end of time.
+        // No capture time is later than the largest one.
         capture_nanos.checked_add(1).map_or_else(BTreeMap::new, |next| self.poses.split_off(&next))
     }
 
-    /// A sweep has come. Returns the one it takes the place of.
+    /// Adds a sweep. Returns the one that it replaces.
     #[must_use]
     pub fn add_sweep(&mut self, capture_nanos: u64, sweep: S, now: Instant) -> Option<S> {
         self.waiting.replace((capture_nanos, sweep, now)).map(|(_, superseded, _)| superseded)
     }
 
-    /// The sweep, if there is nothing left to wait for, and how many poses will never find theirs.
+    /// The sweep, if there is nothing left to wait for, and the number of poses without a sweep.
     pub fn next(&mut self, now: Instant) -> Option<(PairedSweep<S>, usize)> {
         let &(capture_nanos, _, since) = self.waiting.as_ref()?;
         let pose = self.poses.get(&capture_nanos).copied();
-        // Poses come in order: a later one tells that this sweep's own is lost.
+        // Poses arrive in order: a later one shows that this sweep's own is lost.
         let is_lost = self.poses.range((Bound::Excluded(capture_nanos), Bound::Unbounded)).next().is_some();
         if pose.is_none() && !is_lost && now < since + self.patience {
             return None;
@@ -76,7 +76,7 @@ impl<S> SweepPairing<S> {
         Some((PairedSweep { capture_nanos, sweep, pose }, unused))
     }
 
-    /// When to ask again though nothing has come.
+    /// Time of the next call of [`Self::next`] if nothing arrives.
     #[must_use]
     pub fn deadline(&self) -> Option<Instant> {
         self.waiting.as_ref().map(|(_, _, since)| *since + self.patience)
@@ -99,7 +99,7 @@ mod tests {
     }
 
     #[test]
-    fn a_sweep_meets_its_pose_in_either_order() {
+    fn a_sweep_is_paired_with_its_pose_in_either_order() {
         let (mut pairing, now) = (SweepPairing::new(PATIENCE), Instant::now());
         assert_eq!(pairing.add_pose(10, at(1.0)), 0);
         assert_eq!(pairing.add_sweep(10, 'a', now), None);
@@ -119,16 +119,16 @@ mod tests {
         assert_eq!(pairing.add_sweep(30, 'c', now), None);
         assert_eq!(paired(&mut pairing, now), None);
         assert_eq!(pairing.deadline(), Some(now + PATIENCE));
-        assert_eq!(paired(&mut pairing, now + PATIENCE), Some((30, 'c', None, 1)), "the pose of 20 found no sweep");
+        assert_eq!(paired(&mut pairing, now + PATIENCE), Some((30, 'c', None, 1)), "the pose of 20 has no sweep");
     }
 
     #[test]
-    fn a_scene_that_begins_anew_is_not_mistaken_for_one_whose_poses_are_lost() {
+    fn a_restarted_scene_is_not_mistaken_for_one_with_lost_poses() {
         let (mut pairing, now) = (SweepPairing::new(PATIENCE), Instant::now());
         assert_eq!(pairing.add_pose(90, at(9.0)) + pairing.add_pose(100, at(10.0)), 0);
-        assert_eq!(pairing.add_pose(10, at(1.0)), 2, "those of the old scene have to go, and are told");
+        assert_eq!(pairing.add_pose(10, at(1.0)), 2, "those of the old scene are dropped and counted");
         assert_eq!(pairing.add_sweep(20, 'b', now), None);
-        assert_eq!(paired(&mut pairing, now), None, "its own may still come");
+        assert_eq!(paired(&mut pairing, now), None, "its own may still arrive");
         assert_eq!(pairing.add_pose(20, at(2.0)), 0);
         assert_eq!(paired(&mut pairing, now), Some((20, 'b', Some(2.0), 1)));
         assert_eq!(pairing.add_pose(30, at(3.0)), 0);
@@ -136,7 +136,7 @@ mod tests {
     }
 
     #[test]
-    fn the_last_moment_there_is_has_nothing_after_it() {
+    fn the_largest_capture_time_has_no_later_poses() {
         let (mut pairing, now) = (SweepPairing::new(PATIENCE), Instant::now());
         assert_eq!(pairing.add_pose(10, at(1.0)) + pairing.add_pose(u64::MAX, at(2.0)), 0);
         assert_eq!(pairing.add_sweep(u64::MAX, 'z', now), None);
@@ -146,7 +146,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_overtaken_is_given_back() {
+    fn replaced_sweeps_are_returned() {
         let (mut pairing, now) = (SweepPairing::new(PATIENCE), Instant::now());
         assert_eq!(pairing.add_sweep(10, 'a', now), None);
         assert_eq!(pairing.add_sweep(20, 'b', now), Some('a'));

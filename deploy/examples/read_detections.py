@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Prints what the ego of a running fleet detects, as one JSON message per frame tells it.
+"""Prints the detections of the ego of a running fleet, from one JSON message per frame.
 
     pip install eclipse-zenoh
     read_detections.py --connect tcp/127.0.0.1:7447 [--run RUN] [--count FRAMES]
@@ -23,7 +23,7 @@ config = zenoh.Config()
 for key, value in {"mode": "client", "connect/endpoints": [args.connect], "scouting/multicast/enabled": False}.items():
     config.insert_json5(key, json.dumps(value))
 with zenoh.open(config) as session:
-    # Kept under a name: a subscriber that nobody holds ends.
+    # Kept under a name: a subscriber without a reference ends.
     subscriber = session.declare_subscriber(f"v2v/{args.run}/*/detections/json")
     for number, sample in enumerate(subscriber, start=1):
         frame = json.loads(sample.payload.to_string())

@@ -9,7 +9,7 @@ use std::process::ExitCode;
 use clap::Parser;
 use support::cli::exit_code;
 
-/// Collaborative perception without GNSS as a distributed system: run it, judge it, look at it.
+/// Collaborative perception without GNSS as a distributed system: run, evaluate and view it.
 #[derive(Debug, Parser)]
 #[command(
     name = "v2vloc",

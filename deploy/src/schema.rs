@@ -1,4 +1,4 @@
-//! JSON schemas of the files that people write, from the types that read them.
+//! JSON schemas of the configuration files, generated from the types that read them.
 
 use schemars::{JsonSchema, SchemaGenerator, generate::SchemaSettings};
 
@@ -22,7 +22,7 @@ pub enum SchemaOf {
 }
 
 impl SchemaOf {
-    /// Every kind of file, with the place of its schema below `deploy`.
+    /// Every kind of file, with the path of its schema below `deploy`.
     pub const ALL: [(Self, &'static str); 4] = [
         (Self::Scenario, "scenarios/scenario.schema.json"),
         (Self::Experiment, "experiments/experiment.schema.json"),

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Turns a checkpoint of OpenCOOD, CoAlign or Where2comm into a weights file of v2vloc.
+"""Converts a checkpoint of OpenCOOD, CoAlign or Where2comm into a weights file of v2vloc.
 
     deploy/tools/convert_opencood.py net_epoch60.pth --config config.yaml --out v2vnet.safetensors
 
@@ -10,7 +10,7 @@ out is complete alone: weights under the names that v2vloc uses, the sizes of de
 
 Models that are understood, by `model.core_method`:
 
-    point_pillar                          method none; early or late, where `fusion.core_method` says so
+    point_pillar                          method none; early or late, according to `fusion.core_method`
     point_pillar_v2vnet                   method v2vnet
     point_pillar_transformer              method v2xvit
     point_pillar_cobevt                   method cobevt
@@ -29,12 +29,12 @@ Every tensor is used or named: one that the network does not have, or that it ha
 
 What to know before trusting the numbers:
 
-* Those code bases measure in frames whose y axis points right, unlike v2vloc: the file says so (`y_axis`), and clouds and
+* Those code bases measure in frames whose y axis points right, unlike v2vloc: the file states it (`y_axis`), and clouds and
   boxes are mirrored around the network. Real-world data sets (DAIR-V2X, V2V4Real) have y to the left: `--y-axis left`.
 * Models with `proj_first: true` were trained on clouds brought to the ego's frame before they were encoded. An agent on
   the road cannot do that; its maps are turned instead, which such a network has not learnt to read.
 * Converted weights move neighbours' maps with v2vloc's own warp, not that of the code base (multi-scale: CoAlign's).
-* With `compression`, the compressed map crosses the air: one channel in so many.
+* With `compression`, the compressed map is transmitted: one channel in so many.
 * The direction head of CoAlign's models is left out: boxes may face backwards, which no overlap notices.
 * Where2comm's threshold and window are settings of the sender, not weights: they are printed for `agent run`.
 """
@@ -54,10 +54,10 @@ from opencood_models import (
 from opencood_refused import FLOATS, Refused
 from safetensors_file import write_safetensors
 
-# What a network of v2vloc has no use for, by the end or the beginning of its name.
+# Tensors that a network of v2vloc does not use, by the end or the beginning of their names.
 UNUSED_ENDS = ("num_batches_tracked", "relative_position_index", "relative_indices")
 UNUSED_BEGINNINGS = ("dir_head.", "teacher.", "fusion_net.naive_communication.", "fusion_net.encoder.prior_feed.")
-# Names in a message at most.
+# Largest number of names in a message.
 SHOWN = 8
 EXPECTED = "expected is the state dictionary of the configured model, as torch.save(model.state_dict(), path) writes it"
 # Bits of the exponent, which are all set where a value is no finite number.
@@ -85,15 +85,15 @@ def parse_arguments():
     parser.add_argument("--model", help="core_method, where the configuration holds the model's arguments alone")
     parser.add_argument("--out", type=Path, required=True, help="weights file to write")
     parser.add_argument("--y-axis", choices=["right", "left"], default="right", help="of the data it was trained on")
-    parser.add_argument("--max-points", type=int, help="points of a pillar at most; left out: as preprocess says")
+    parser.add_argument("--max-points", type=int, help="largest number of points of a pillar; left out: that of preprocess")
     parser.add_argument(
-        "--leave-out", nargs="+", default=[], metavar="PREFIX", help="tensors that the network has no use for"
+        "--leave-out", nargs="+", default=[], metavar="PREFIX", help="tensors that the network does not use"
     )
     return parser.parse_args()
 
 
 def convert(arguments):
-    """Writes the weights file; what came out, in a line or a few."""
+    """Writes the weights file; returns a summary of a few lines."""
     state, metadata, taken_from = read_checkpoint(arguments.checkpoint)
     hypes = read_config(arguments.config, arguments.checkpoint, metadata)
     name, model = model_section(hypes, arguments.model)
@@ -104,7 +104,7 @@ def convert(arguments):
     if "kind" in header and detector["compress_ratio"] is not None:
         if name != "point_pillar_where2comm":
             raise model.refuse("compression", f"is {detector['compress_ratio']}, which is not understood before a fusion of levels")
-        # It computes the squeezed map and then goes on with others.
+        # It computes the compressed map and does not use it.
         detector["compress_ratio"] = None
         unused.append("naive_compressor.")
     label = f"{arguments.checkpoint}, {taken_from}" if taken_from else f"{arguments.checkpoint}"
@@ -125,12 +125,12 @@ def report(path, weights, header, left_out, taken_from):
     if detector["compress_ratio"]:
         channels = feature_channels(detector)
         sent = max(channels // detector["compress_ratio"], 1)
-        lines.append(f"compressed maps cross the air: {sent} of {channels} channels")
+        lines.append(f"compressed maps are transmitted: {sent} of {channels} channels")
     return "\n".join(lines)
 
 
 def listed(names):
-    """Names, those that only count batches as one entry."""
+    """Names; all batch counters form one entry."""
     counters = [name for name in names if name.endswith("num_batches_tracked")]
     others = [name for name in names if name not in counters]
     shown = others[:SHOWN] + ([f"{len(others) - SHOWN} more"] if len(others) > SHOWN else [])
@@ -143,7 +143,7 @@ def model_section(hypes, model):
         section = hypes.section("model")
         name, arguments = model or section.text("core_method"), section.section("args")
     elif model is None:
-        raise hypes.refuse("model", "is missing, and no --model says which one these are the arguments of")
+        raise hypes.refuse("model", "is missing, and no --model names the model of these arguments")
     else:
         name, arguments = model, hypes
     check_understood(name, hypes)
@@ -151,7 +151,7 @@ def model_section(hypes, model):
 
 
 def select(label, state, wanted, unused):
-    """The weights under their new names, and the names of those that nothing reads."""
+    """The weights under their new names, and the names of unused ones."""
     if not any(name.startswith("pillar_vfe.") for name in state):
         names = listed(sorted(state)) or "none"
         raise Refused(f"{label}: no tensor of a pillar encoder (pillar_vfe.*) among {names}; {EXPECTED}")
@@ -173,7 +173,7 @@ def select(label, state, wanted, unused):
 
 
 def is_single_scale(name):
-    """Whether a tensor is of the fusion of one map, which has another name in v2vloc."""
+    """True if a tensor is of the fusion of one map, which has another name in v2vloc."""
     return name.startswith("fusion_net.") and not name.startswith("fusion_net.naive_communication.")
 
 

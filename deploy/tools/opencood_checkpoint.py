@@ -1,4 +1,4 @@
-"""The tensors of a checkpoint file, whatever training loop has written it."""
+"""Reader of the tensors of a checkpoint file of any training loop."""
 
 import math
 
@@ -8,13 +8,13 @@ from torch_file import Lazy, Stub, read_legacy, read_zip
 
 # Keys under which training loops keep the state dictionary, the likeliest first.
 STATE_KEYS = ("model_state_dict", "state_dict", "model_state", "model", "net", "network", "weights")
-# What wraps a model puts its own name before every tensor's.
+# Wrappers of a model put their own names before every tensor's.
 WRAPPERS = ("module.", "_orig_mod.")
 MAX_DEPTH = 64
 
 
 def read_checkpoint(path):
-    """Name -> (dtype, shape, little-endian bytes) of every tensor, the texts of the header, and what it was read out of."""
+    """Name -> (dtype, shape, little-endian bytes) of every tensor, the texts of the header, and its container."""
     size = path.stat().st_size
     with path.open("rb") as file:
         begin = file.read(512)
@@ -30,7 +30,7 @@ def read_checkpoint(path):
 
 
 def not_a_checkpoint(begin, size):
-    """What a file is that is no checkpoint at all, by its first bytes."""
+    """Kind of a file that is no checkpoint, by its first bytes."""
     if size == 0:
         return "an empty file"
     if size > MAX_FILE_BYTES:
@@ -54,7 +54,7 @@ def is_tensor(value):
 
 
 def state_dictionary(path, loaded, depth=0):
-    """The tensors by name, and what they had to be taken out of."""
+    """The tensors by name, and their container."""
     if isinstance(loaded, Stub) and "_parameters" in loaded.attributes:
         whole = f"{type(loaded).__module__}.{type(loaded).__name__}"
         return dict(of_module(loaded, "", 0)), f"a whole pickled model of class {whole}"
@@ -116,7 +116,7 @@ def materialized(path, state):
 
 
 def unwrapped(path, tensors):
-    """The same without the prefixes of what wraps a model: DataParallel, a compiled model, a training harness."""
+    """The same without the prefixes of wrappers: DataParallel, a compiled model, a training harness."""
     while tensors and all(name.startswith("model.") for name in tensors):
         tensors = {name.removeprefix("model."): tensor for name, tensor in tensors.items()}
     names = {}

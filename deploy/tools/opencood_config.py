@@ -1,4 +1,4 @@
-"""The configuration beside a checkpoint, entry by entry: what is not there, or not what it has to be, is named."""
+"""Reader of the configuration beside a checkpoint, entry by entry: errors name missing and invalid entries."""
 
 import json
 
@@ -9,7 +9,7 @@ REQUIRED = object()
 
 
 def read_config(path, checkpoint, metadata):
-    """The configuration file, or what the header of a safetensors file says."""
+    """The configuration file, or the header of a safetensors file."""
     if path is None:
         if not isinstance(metadata, dict) or "config" not in metadata:
             raise Refused(f"{checkpoint}: no configuration lies in it; --config names the config.yaml beside it")
@@ -59,7 +59,7 @@ def parsed_yaml(path, text):
 
 
 class Section:
-    """A part of a configuration that knows where it stands."""
+    """A part of a configuration with its path."""
 
     def __init__(self, values, label, name):
         self.values, self.label, self.name = values, label, name
@@ -92,7 +92,7 @@ class Section:
         return self.get(key, "a name", lambda value: isinstance(value, str), default)
 
     def choice(self, key, choices, default=REQUIRED):
-        """What `choices` has for an entry."""
+        """The value in `choices` for an entry."""
         names = " or ".join(choices)
         return choices[self.get(key, names, lambda value: isinstance(value, str) and value in choices, default)]
 

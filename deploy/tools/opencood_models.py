@@ -8,7 +8,7 @@ UNDERSTOOD = (
     "point_pillar_baseline", "point_pillar_where2comm", "point_pillar_coalign", "point_pillar_baseline_multiscale",
     "point_pillar_intermediate",
 )  # fmt: skip
-# What a network for one vehicle was trained for, by the beginning of `fusion.core_method`.
+# Method that a network for one vehicle was trained for, by the beginning of `fusion.core_method`.
 DATASET_METHODS = {"early": "early", "late": "late", "intermediate": "none"}
 # Points on the carrier itself are cut out by these code bases too: x and y of the lower, then of the upper corner.
 OWN_BODY_M = [-1.95, -1.1, 2.95, 1.1]
@@ -22,7 +22,7 @@ def check_understood(name, hypes):
 
 
 def dataset_method(name, hypes):
-    """The method of a network for one vehicle; all others fuse maps, whatever they were trained on."""
+    """The method of a network for one vehicle; all others fuse maps, independent of their training."""
     dataset = hypes.section("fusion", None)
     dataset = dataset and dataset.text("core_method", None)
     if dataset is None:

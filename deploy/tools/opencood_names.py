@@ -1,8 +1,8 @@
-"""The names of the tensors of each network, so that none of a checkpoint is passed over and none is missing."""
+"""The names of the tensors of each network, to detect unused and missing tensors of a checkpoint."""
 
 NORM = ("weight", "bias", "running_mean", "running_var")
 LINEAR = ("weight", "bias")
-# V2X-ViT tells vehicles from infrastructure.
+# V2X-ViT distinguishes vehicles from infrastructure.
 AGENT_TYPES = 2
 
 

@@ -1,4 +1,4 @@
-"""What is common to everything that reads a checkpoint."""
+"""Error of the readers of a checkpoint."""
 
 FLOATS = {"F16": 2, "BF16": 2, "F32": 4, "F64": 8}
 SIZES = FLOATS | {"I64": 8, "I32": 4, "I16": 2, "I8": 1, "U8": 1, "BOOL": 1}

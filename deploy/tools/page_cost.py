@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-"""Measures what an open page costs a run: the same fleet again and again, with and without somebody who reads the page's stream.
+"""Measures the cost of an open page for a run: the same fleet repeatedly, with and without a reader of the page's stream.
 
     cargo build --release --workspace --bins
     deploy/tools/page_cost.py [--rounds 4] [--frames 150] [--method max] [--scene DIR]
 
-A round is a run with and one without, in alternating order, so that whatever else the machine does falls on both. The reader
-takes every moment and throws it away, as a browser on another machine would; the server of the page runs on this one. Where Linux
-allows it the reader computes only when nobody else wants to, since on another machine it would take nothing from this one.
+A round is a run with and one without, in alternating order, so that other load of the machine affects both. The reader
+reads and discards every frame, as a browser on another machine would; the server of the page runs on this one. Where Linux
+allows it the reader computes only on idle processor time, since on another machine it would use none of this one's.
 Prints the 95th percentile of the latency from capture to detection of every run, of both sides pooled, and their ratio.
 """
 
@@ -44,14 +44,14 @@ def generate(folder, frames):
 
 
 def scenario(folder, scene):
-    """Without the search for poses, which takes most of the time of an agent."""
+    """Without localization, which takes most of the time of an agent."""
     file = folder / "scenario.yaml"
     file.write_text(f"scene: {{dir: {scene}}}\nmodels: {{weights: {ROOT / 'deploy/weights'}}}\nagents: {{pose: recorded}}\n")
     return file
 
 
 def line_with(stream, pattern):
-    """The first match among the lines of a process; the rest is read and thrown away, so that it never waits for us."""
+    """The first match among the lines of a process; the rest is read and discarded, so that the process never blocks."""
     for line in stream:
         if match := re.search(pattern, line):
             threading.Thread(target=lambda: all(stream), daemon=True).start()
@@ -60,7 +60,7 @@ def line_with(stream, pattern):
 
 
 class Page:
-    """A viewer, and somebody who reads what it streams."""
+    """A viewer, and a reader of its stream."""
 
     def __init__(self, name, router):
         command = [PROGRAMS / "v2vloc", "view", "--live", "--name", name, "--connect", router, "--listen", "127.0.0.1:0"]
@@ -89,7 +89,7 @@ class Page:
 
 
 def run(options, scene, folder, name, with_page):
-    """Latencies of one run, and how many moments the page was shown."""
+    """Latencies of one run, and the number of frames that the page received."""
     command = [PROGRAMS / "v2vloc", "up", options.scenario, "--scene", scene, "--method", options.method]
     command += ["--frames", str(options.frames), "--name", name, "--runs", folder, "--json"]
     fleet = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
@@ -98,7 +98,7 @@ def run(options, scene, folder, name, with_page):
     code = fleet.wait()
     if page:
         page.close()
-    # 3: a machine too slow for live traffic drops frames and says so.
+    # 3: a machine too slow for live traffic drops frames and reports it.
     if code not in (0, 3):
         sys.exit(f"the run {name} ended with {code}")
     with open(folder / name / "frames.csv") as frames:
@@ -127,7 +127,7 @@ def main():
                 shown = f", {moments} moments shown" if with_page else ""
                 print(f"{name}: p95 {p95(latencies):.1f} ms of {len(latencies)} frames{shown}", flush=True)
         alone, page = p95(pooled[False]), p95(pooled[True])
-        print(f"all: p95 {alone:.1f} ms alone, {page:.1f} ms with the page, ratio {page / alone:.3f}")
+        print(f"all: p95 {alone:.1f} ms without a page, {page:.1f} ms with it, ratio {page / alone:.3f}")
 
 
 if __name__ == "__main__":

@@ -29,7 +29,7 @@ HAS_YAML = importlib.util.find_spec("yaml") is not None
 
 
 def stand_in(module, name, made=None):
-    """Something that a pickle calls `module.name`."""
+    """An object that a pickle names `module.name`."""
     made = made or type(name, (), {})
     made.__module__, made.__qualname__, made.__name__ = module, name, name
     package = ""
@@ -143,7 +143,7 @@ class Conversions(unittest.TestCase):
         self.folder = Path(folder.name)
 
     def convert(self, checkpoint, config=None, *arguments, suffix=".json"):
-        """Exit code, what is printed, what is complained of."""
+        """Exit code, standard output, standard error."""
         path, out = self.folder / "net.pth", self.folder / "out.safetensors"
         path.write_bytes(checkpoint)
         config_path = self.folder / f"config{suffix}"

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Times OpenCOOD's own fusions at their published sizes, to stand beside `cargo bench -p fusion --bench transformers`.
+"""Times OpenCOOD's own fusions at their published sizes, for comparison with `cargo bench -p fusion --bench transformers`.
 
     deploy/tools/time_opencood.py OPENCOOD [--threads 2] [--times 5] [v2xvit/5 cobevt/2 ...]
 
@@ -28,7 +28,7 @@ def arguments():
 
 
 def model_settings(opencood, name):
-    """What a published configuration says of the model; numbers like 1e-10 come out as texts and do not matter here."""
+    """Model part of a published configuration; numbers like 1e-10 are read as texts and do not matter here."""
     import yaml
 
     path = opencood / "opencood" / "hypes_yaml" / f"{name}.yaml"
@@ -87,7 +87,7 @@ def main():
                 began = time.perf_counter()
                 fuse()
                 taken.append(time.perf_counter() - began)
-        print(f"{case}: {min(taken):.3f} s at best, {statistics.median(taken):.3f} s in the middle of {len(taken)}", flush=True)
+        print(f"{case}: {min(taken):.3f} s at best, {statistics.median(taken):.3f} s median of {len(taken)}", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""A file of torch.save as plain objects, read without running anything that it names.
+"""Reader of torch.save files as plain objects, without running any code that they name.
 
 Such a file is a pickle: to load one is to run what it asks for. Here every class and function of a pickle is an inert stub,
 but for the few that a tensor is made of. Nothing but the standard library is needed.
@@ -36,14 +36,14 @@ class Storage:
 
 
 class State(OrderedDict):
-    """A dictionary whose attributes, which torch keeps versions in, nobody reads."""
+    """A dictionary whose attributes, which hold versions of torch, are ignored."""
 
     def __setstate__(self, _state):
         pass
 
 
 class Stub:
-    """An object of a class that is not known here: keeps its attributes and does nothing."""
+    """An object of an unknown class: keeps its attributes and does nothing."""
 
     def __new__(cls, *_arguments, **_named):
         made = object.__new__(cls)
@@ -51,7 +51,7 @@ class Stub:
         return made
 
     def __init__(self, *_arguments, **_named):
-        """Whatever it was made with is of no use."""
+        """Constructor arguments are ignored."""
 
     def __setstate__(self, state):
         self.attributes = state if isinstance(state, dict) else {}
@@ -60,13 +60,13 @@ class Stub:
         pass
 
     def append(self, _item):
-        """As a list that nobody reads."""
+        """List items are ignored."""
 
     def extend(self, _items):
-        """As a list that nobody reads."""
+        """List items are ignored."""
 
     def add(self, _item):
-        """As a set that nobody reads."""
+        """Set items are ignored."""
 
 
 class Unpickler(pickle._Unpickler):
@@ -155,7 +155,7 @@ def read_archive(path, archive):
 
 
 def read_member(archive, name, limit):
-    """A file of an archive: no more than `limit` bytes of it, whatever it claims."""
+    """A file of an archive: at most `limit` bytes of it, independent of its stated size."""
     try:
         with archive.open(name) as file:
             return file.read(limit)
@@ -190,6 +190,6 @@ def unpickle(path, file, storage_of):
         return Unpickler(file, storage_of).load()
     except (Refused, zipfile.BadZipFile):
         raise
-    # Whatever a pickle makes its reader trip over.
+    # Any error of the unpickler.
     except Exception as error:
         raise Refused(f"{path}: a pickle that is cut off or damaged ({type(error).__name__}: {error}); {EXPECTED}") from error

@@ -26,11 +26,11 @@ pub struct EgoConfig {
     #[arg(long)]
     #[serde(default)]
     pub method: Option<Method>,
-    /// Neighbours that may take part. None named: all that are found.
+    /// Neighbours that may take part. None named: all that are discovered.
     #[arg(long, value_name = "IDS", value_delimiter = ',', allow_hyphen_values = true)]
     #[serde(default)]
     pub neighbours: Vec<CavId>,
-    /// Communication range: neighbours farther away have no part, metres in the plane.
+    /// Communication range: neighbours farther away are ignored, metres in the plane.
     #[arg(long, value_name = "M")]
     #[serde(default = "comm_range_m")]
     pub comm_range_m: f64,
@@ -38,11 +38,11 @@ pub struct EgoConfig {
     #[arg(long)]
     #[serde(default)]
     pub over_link: bool,
-    /// Go on when the own agent ends, for the next one; always so with `supervised`.
+    /// Continue when the own agent ends, for its next instance; always set with `supervised`.
     #[arg(long)]
     #[serde(default)]
     pub keep_running: bool,
-    /// Vehicle, deadline, age, trust and limits.
+    /// Vehicle, deadline, age, misbehaviour detection and limits.
     #[command(flatten)]
     #[serde(default)]
     pub ego: EgoSettings,
@@ -74,7 +74,7 @@ pub struct EgoSettings {
     /// Leave out neighbours whose messages contradict what the ego perceives itself.
     #[arg(long)]
     pub trust: bool,
-    /// Limits of what other vehicles send.
+    /// Limits of the messages of other vehicles.
     #[command(flatten)]
     pub inbox: InboxConfig,
 }
@@ -96,13 +96,13 @@ impl EgoSettings {
         self.inbox.validate()
     }
 
-    /// Which messages are paired with a frame.
+    /// Pairing of messages with a frame.
     #[must_use]
     pub fn pairing(&self) -> PairingConfig {
         PairingConfig::with_max_age_nanos(self.max_age_ms.saturating_mul(1_000_000))
     }
 
-    /// Misbehaviour detection, where it is asked for.
+    /// Misbehaviour detection, if it is enabled.
     #[must_use]
     pub fn trust(&self) -> Option<MisbehaviourConfig> {
         self.trust.then(MisbehaviourConfig::default)

@@ -1,6 +1,6 @@
 //! The ego's pipeline: its own view and those of its neighbours in, boxes around it out.
 //!
-//! Synchronous and without any network: live process, offline evaluation, tests and benches run the same lines, and the
+//! Synchronous and without any network: live process, offline evaluation, tests and benches run the same code, and the
 //! same views give the same bits.
 
 mod box_correction;
@@ -28,12 +28,12 @@ use fusion::{AlignedMaps, MapMetadata, ReceivedMaps};
 pub use crate::view::{Content, View};
 pub use error::EgoError;
 
-/// Why a neighbour is not in a result.
+/// Reason why a neighbour is not in a result.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Skipped {
     /// The method exchanges nothing.
     NotNeeded,
-    /// Its message cannot be used, or is of somebody too far away.
+    /// Its message cannot be used, or its sender is out of range.
     Unusable(DropReason),
 }
 
@@ -46,9 +46,9 @@ pub struct EgoOutput {
     pub fused: Vec<usize>,
     /// The other neighbours, each with its reason.
     pub skipped: Vec<(usize, Skipped)>,
-    /// How far each neighbour that could be fused is believed; empty where nobody asks.
+    /// Assessment of each neighbour that could be fused; empty without misbehaviour detection.
     pub beliefs: Vec<(usize, Assessment)>,
-    /// Where the time went.
+    /// Durations of the stages.
     pub stages: Vec<StageTiming>,
 }
 
@@ -65,7 +65,7 @@ pub struct Ego {
 }
 
 impl Ego {
-    /// The communication range of OPV2V and its relatives, metres: what holds unless another is asked for.
+    /// The communication range of OPV2V and related data sets, metres: the default.
     pub const COMM_RANGE_M: f64 = 70.0;
 
     /// Reads the weights; `method` overrides the one that the file names.
@@ -84,7 +84,7 @@ impl Ego {
         Ok(Self::assembled(detector, method, fusion))
     }
 
-    /// The pipeline of a method around a detector, with an untrained fusion and the channels of neighbours as they come.
+    /// The pipeline of a method around a detector, with an untrained fusion and unmixed channels of neighbours.
     ///
     /// # Errors
     /// [`EgoError::Fusion`] when no fusion can be built behind the detector.
@@ -99,16 +99,16 @@ impl Ego {
         Self { method, detector, fusion, history, trust: None, limits, comm_range_m: Self::COMM_RANGE_M }
     }
 
-    /// The same with another communication range: neighbours farther away, metres in the plane, have no part.
+    /// The same with another communication range: neighbours farther away, metres in the plane, are ignored.
     #[must_use]
     pub fn with_comm_range(self, comm_range_m: f64) -> Self {
         Self { comm_range_m, ..self }
     }
 
-    /// The same leaving out neighbours whose words do not fit what the ego sees itself.
+    /// The same with misbehaviour detection: leaves out neighbours whose messages contradict the ego's perception.
     ///
     /// # Errors
-    /// The tensor library's.
+    /// Those of the tensor library.
     pub fn with_trust(mut self, config: Option<MisbehaviourConfig>) -> Result<Self, EgoError> {
         self.trust = config.map(|config| MisbehaviourDetector::new(config, &mut self.detector)).transpose()?;
         Ok(self)
@@ -126,16 +126,16 @@ impl Ego {
         &self.detector
     }
 
-    /// Forgets the maps of earlier frames: another scene begins.
+    /// Removes the maps of earlier frames: another scene begins.
     pub fn forget(&mut self) {
         self.history.clear();
         self.trust.iter_mut().for_each(MisbehaviourDetector::clear);
     }
 
-    /// Detects around the ego. Neighbours that cannot be used are left out; with none left the ego goes on alone.
+    /// Detects around the ego. Neighbours that cannot be used are left out; with none left the result is ego-only.
     ///
     /// # Errors
-    /// [`EgoError`] when the ego's own view is not what the method takes.
+    /// [`EgoError`] when the ego's own view does not have the content that the method needs.
     pub fn detect(&mut self, own: &View, neighbours: &[View]) -> Result<EgoOutput, EgoError> {
         let needed = self.method.own_content();
         if own.content.exchange() != needed {
@@ -159,8 +159,8 @@ impl Ego {
         if self.trust.is_some() && !fused.is_empty() {
             let found = self.judge(&aligned)?;
             let is_out: Vec<bool> = found.iter().map(Assessment::is_out).collect();
-            let doubted = fused.iter().zip(&is_out).filter(|(_, is_out)| **is_out);
-            skipped.extend(doubted.map(|(&index, _)| (index, Skipped::Unusable(DropReason::Distrusted))));
+            let left_out = fused.iter().zip(&is_out).filter(|(_, is_out)| **is_out);
+            skipped.extend(left_out.map(|(&index, _)| (index, Skipped::Unusable(DropReason::Distrusted))));
             beliefs = fused.iter().copied().zip(found).collect();
             fused = keep(fused, &is_out);
             let mut others = keep(aligned.split_off(1), &is_out);
@@ -175,14 +175,14 @@ impl Ego {
         Ok(EgoOutput { detections, fused, skipped, beliefs, stages: stages.into_timings() })
     }
 
-    /// How far each of the neighbours, which follow the ego itself, is believed.
+    /// Assessment of each of the neighbours, which follow the ego itself.
     fn judge(&mut self, aligned: &[Aligned<'_>]) -> Result<Vec<Assessment>, EgoError> {
         let Some(trust) = &mut self.trust else { return Ok(Vec::new()) };
-        let told: Vec<(&View, Pose)> = aligned[1..].iter().map(|view| (view.view, view.ego_from_cav)).collect();
-        Ok(no_grad(|| trust.judge(aligned[0].view, &told, &mut self.detector))?)
+        let neighbours: Vec<(&View, Pose)> = aligned[1..].iter().map(|view| (view.view, view.ego_from_cav)).collect();
+        Ok(no_grad(|| trust.judge(aligned[0].view, &neighbours, &mut self.detector))?)
     }
 
-    /// Where a neighbour stands relative to the ego, or why it has no part.
+    /// Pose of a neighbour relative to the ego, or the reason why it is left out.
     fn align(&self, own: &View, view: &View) -> Result<Pose, Skipped> {
         if self.method.exchange() == Exchange::Nothing {
             return Err(Skipped::NotNeeded);
@@ -215,7 +215,7 @@ impl Ego {
             && sent.as_ref().is_none_or(|sent| sent.len() == cells)
     }
 
-    /// Intermediate fusion, and the ego alone.
+    /// Intermediate fusion, and ego-only detection.
     fn merge_features(&mut self, aligned: &[Aligned<'_>], stages: &mut StageTimes) -> Result<Vec<Detection>, EgoError> {
         let (mut maps, mut sent) = (Vec::with_capacity(aligned.len()), Vec::with_capacity(aligned.len()));
         for Aligned { view, .. } in aligned {
@@ -252,7 +252,7 @@ impl Ego {
         Ok(detections)
     }
 
-    /// A map `[1, C, H, W]` and what was sent of it `[1, 1, H, W]`.
+    /// A feature map `[1, C, H, W]` and the mask of its sent cells `[1, 1, H, W]`.
     fn tensors(&self, map: &DecodedFeatures, is_ego: bool) -> Result<(Tensor, Tensor), EgoError> {
         let [channels, height, width] = self.detector.sent_shape();
         if !self.is_own_shape(map) {
@@ -266,8 +266,8 @@ impl Ego {
         Ok((self.detector.received(map)?, sent_cells(map, is_ego, [height, width])?))
     }
 
-    /// The kept maps of the vehicles that take part, and where they belong now. An ego that does not know where it is
-    /// cannot say.
+    /// The kept maps of the vehicles that take part, with their poses in the ego's current frame. An ego without a pose
+    /// has none.
     fn earlier(&self, aligned: &[Aligned<'_>]) -> Vec<(usize, &KeptMap, Pose)> {
         let Some(world_from_ego) = aligned[0].view.pose.world_from_cav() else { return Vec::new() };
         let of_agent = |(agent, Aligned { view, .. }): (usize, &Aligned<'_>)| {
@@ -278,7 +278,7 @@ impl Ego {
         aligned.iter().enumerate().flat_map(of_agent).collect()
     }
 
-    /// Keeps the maps of this frame for those to come.
+    /// Keeps the maps of this frame for later frames.
     fn keep(
         &mut self,
         aligned: &[Aligned<'_>],
@@ -350,7 +350,7 @@ fn keep<T>(items: Vec<T>, is_out: &[bool]) -> Vec<T> {
     items.into_iter().zip(is_out).filter_map(|(item, is_out)| (!is_out).then_some(item)).collect()
 }
 
-/// A view and where it lies.
+/// A view and its pose.
 struct Aligned<'a> {
     view: &'a View,
     ego_from_cav: Pose,

@@ -2,7 +2,7 @@
 //!
 //! - [`ego`]: the pipeline, the same live and offline; [`node`]: the process around it.
 //! - [`pairing`]: the messages that belong to a frame.
-//! - [`misbehaviour`]: neighbours whose messages contradict what the ego measures.
+//! - [`misbehaviour`]: neighbours whose messages contradict the ego's perception.
 //!
 //! Conventions of axes, units and boxes are those of [`protocol`].
 

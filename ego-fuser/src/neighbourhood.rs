@@ -1,4 +1,4 @@
-//! Who is around: agents found by their liveliness tokens, and the subscriptions to them.
+//! Neighbourhood: agents discovered by their liveliness tokens, and the subscriptions to them.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
@@ -6,11 +6,11 @@ use std::sync::Arc;
 use bus::{Bus, BusError, Inbox, Membership, Subscription};
 use protocol::{CavId, Role, Stream, Topic};
 
-/// Neighbours that an ego listens to at most: a flood of tokens must not become a flood of subscriptions.
+/// Largest number of subscribed neighbours: a flood of tokens must not become a flood of subscriptions.
 const MAX_NEIGHBOURS: usize = 64;
-/// Vehicles that are remembered at most while there is no place for them.
+/// Largest number of vehicles that wait for a subscription.
 const MAX_QUEUED: usize = 256;
-/// Frames in a row without a word after which a neighbour is not waited for any more, until it speaks again.
+/// Consecutive frames without a message after which a neighbour is not awaited any more, until its next message.
 const SILENT_AFTER: u32 = 3;
 
 /// The other agents of the run.
@@ -19,12 +19,12 @@ pub(crate) struct Neighbourhood {
     streams: Vec<Stream>,
     over_link: bool,
     allowed: Option<BTreeSet<CavId>>,
-    roll_call: Membership,
+    membership: Membership,
     members: BTreeMap<CavId, Member>,
     queue: Queue,
 }
 
-/// Vehicles for which there was no place when they came, first come first: their tokens are not told of again.
+/// Vehicles beyond the limit when they joined, first in first out: their tokens are not announced again.
 #[derive(Default)]
 struct Queue(VecDeque<CavId>);
 
@@ -33,9 +33,9 @@ struct Member {
     _subscriptions: Vec<Subscription>,
 }
 
-/// Where an ego hears a vehicle: directly, or behind the emulated air if there is one. Its own agent it always hears
-/// directly.
-pub(crate) fn heard_on(ego: &CavId, cav: &CavId, stream: Stream, over_link: bool) -> Topic {
+/// Topic on which an ego receives a vehicle: direct, or behind the link emulation if there is one. Its own agent is
+/// always received directly.
+pub(crate) fn topic_of(ego: &CavId, cav: &CavId, stream: Stream, over_link: bool) -> Topic {
     if over_link && cav != ego {
         Topic::Received { ego: ego.clone(), cav: cav.clone(), stream }
     } else {
@@ -43,7 +43,7 @@ pub(crate) fn heard_on(ego: &CavId, cav: &CavId, stream: Stream, over_link: bool
     }
 }
 
-/// Whose message a topic carries, and which.
+/// Sender and stream of a topic's messages.
 pub(crate) fn sender_of(topic: &Topic) -> Option<(&CavId, Stream)> {
     match topic {
         Topic::Stream { cav, stream } | Topic::Received { cav, stream, .. } => Some((cav, *stream)),
@@ -52,8 +52,8 @@ pub(crate) fn sender_of(topic: &Topic) -> Option<(&CavId, Stream)> {
 }
 
 impl Neighbourhood {
-    /// Watches for agents other than `ego`'s own, to listen to these streams of theirs, behind the link where there is
-    /// one; `allowed` restricts them.
+    /// Watches for agents other than `ego`'s own, to subscribe to these streams of theirs, behind the link where there
+    /// is one; `allowed` restricts them.
     pub(crate) fn watch(
         bus: &Bus,
         ego: &CavId,
@@ -61,15 +61,15 @@ impl Neighbourhood {
         over_link: bool,
         allowed: Option<BTreeSet<CavId>>,
     ) -> Result<Self, BusError> {
-        let roll_call = Membership::begin(bus, Role::Agent, 2 * MAX_NEIGHBOURS)?;
+        let membership = Membership::begin(bus, Role::Agent, 2 * MAX_NEIGHBOURS)?;
         let (members, queue) = (BTreeMap::new(), Queue::default());
-        Ok(Self { ego: ego.clone(), streams, over_link, allowed, roll_call, members, queue })
+        Ok(Self { ego: ego.clone(), streams, over_link, allowed, membership, members, queue })
     }
 
-    /// Follows up on who came and went; those who went are returned.
+    /// Handles agents that joined and left; returns those that left.
     pub(crate) fn update(&mut self, bus: &Bus, inbox: &Arc<Inbox>) -> Result<Vec<CavId>, BusError> {
         let mut gone = Vec::new();
-        while let Some((cav, is_there)) = self.roll_call.next() {
+        while let Some((cav, is_there)) = self.membership.next() {
             if is_there && self.is_wanted(&cav) {
                 self.queue.add(cav);
             } else if !is_there {
@@ -80,15 +80,15 @@ impl Neighbourhood {
                 }
             }
             while let Some(cav) = self.queue.next(self.members.len()) {
-                self.listen_to(cav, bus, inbox)?;
+                self.subscribe(cav, bus, inbox)?;
             }
         }
         Ok(gone)
     }
 
-    fn listen_to(&mut self, cav: CavId, bus: &Bus, inbox: &Arc<Inbox>) -> Result<(), BusError> {
-        tracing::info!(%cav, "a neighbour has come");
-        let topics = self.streams.iter().map(|&stream| heard_on(&self.ego, &cav, stream, self.over_link));
+    fn subscribe(&mut self, cav: CavId, bus: &Bus, inbox: &Arc<Inbox>) -> Result<(), BusError> {
+        tracing::info!(%cav, "a neighbour has joined");
+        let topics = self.streams.iter().map(|&stream| topic_of(&self.ego, &cav, stream, self.over_link));
         let subscriptions = topics.map(|topic| bus.subscribe(topic, inbox)).collect::<Result<_, _>>()?;
         self.members.insert(cav, Member { silent_frames: 0, _subscriptions: subscriptions });
         Ok(())
@@ -100,25 +100,25 @@ impl Neighbourhood {
             && self.allowed.as_ref().is_none_or(|allowed| allowed.contains(cav))
     }
 
-    /// Everyone who is there.
+    /// All current members.
     pub(crate) fn members(&self) -> impl Iterator<Item = &CavId> {
         self.members.keys()
     }
 
-    /// Those whose word a frame waits for.
+    /// Members whose messages a frame waits for.
     pub(crate) fn awaited(&self) -> impl Iterator<Item = &CavId> {
         self.members.iter().filter(|(_, member)| member.silent_frames < SILENT_AFTER).map(|(cav, _)| cav)
     }
 
-    /// A message came from `cav`.
-    pub(crate) fn spoke(&mut self, cav: &CavId) {
+    /// Records a message from `cav`.
+    pub(crate) fn received(&mut self, cav: &CavId) {
         if let Some(member) = self.members.get_mut(cav) {
             member.silent_frames = 0;
         }
     }
 
-    /// A frame was decided without a word of `cav` for it.
-    pub(crate) fn was_silent(&mut self, cav: &CavId) {
+    /// Records that a frame was decided without a message from `cav`.
+    pub(crate) fn missed(&mut self, cav: &CavId) {
         if let Some(member) = self.members.get_mut(cav) {
             member.silent_frames = member.silent_frames.saturating_add(1);
         }
@@ -126,21 +126,21 @@ impl Neighbourhood {
 }
 
 impl Queue {
-    /// Somebody has come. Of too many the last are passed over.
+    /// Queues a vehicle that joined; beyond the limit it is ignored.
     fn add(&mut self, cav: CavId) {
         if self.0.len() >= MAX_QUEUED {
-            tracing::warn!(%cav, "more vehicles wait to be listened to than can be remembered");
+            tracing::warn!(%cav, "more vehicles wait for a subscription than can be queued");
         } else if !self.0.contains(&cav) {
             self.0.push_back(cav);
         }
     }
 
-    /// Somebody has gone.
+    /// Removes a vehicle that left.
     fn remove(&mut self, cav: &CavId) {
         self.0.retain(|waiting| waiting != cav);
     }
 
-    /// Who has waited longest, where there is a place beside so many members.
+    /// The vehicle that has waited longest, if there is capacity beside so many members.
     fn next(&mut self, members: usize) -> Option<CavId> {
         if members < MAX_NEIGHBOURS { self.0.pop_front() } else { None }
     }
@@ -155,7 +155,7 @@ mod tests {
     }
 
     #[test]
-    fn who_came_while_there_was_no_place_gets_the_next_that_is_free() {
+    fn a_vehicle_that_joined_beyond_the_limit_gets_the_next_free_place() {
         let mut queue = Queue::default();
         [0, 1, 2, 1].into_iter().for_each(|number| queue.add(cav(number)));
         assert_eq!(queue.next(MAX_NEIGHBOURS), None);
@@ -166,7 +166,7 @@ mod tests {
     }
 
     #[test]
-    fn a_flood_of_tokens_is_not_remembered() {
+    fn a_flood_of_tokens_is_bounded() {
         let mut queue = Queue::default();
         (0..1000).for_each(|number| queue.add(cav(number)));
         assert_eq!(queue.0.len(), MAX_QUEUED);

@@ -1,20 +1,20 @@
-//! Which message of each CAV belongs to a frame of the ego: by capture time, never by arrival.
+//! Pairing: selects the message of each CAV for a frame of the ego by capture time, not by arrival.
 //!
-//! For every CAV the newest message that is not younger than the ego's frame is taken, unless it is too old. What is
-//! younger waits for its frame. A message that served one frame may serve the next one too, should nothing newer come
+//! For every CAV the newest message that is not younger than the ego's frame is taken, unless it is too old. Younger
+//! messages wait for their frame. A message that served one frame may serve the next one too, if no newer one arrives
 //! in time; it is counted as received once.
 
 use std::collections::{BTreeMap, VecDeque};
 
 use protocol::{CavId, DropReason};
 
-/// When messages count.
+/// Limits of pairing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct PairingConfig {
     /// A message captured longer before the ego's frame is not used, nanoseconds.
     pub max_age_nanos: u64,
-    /// A message captured so little after the ego's frame still counts as of its time, nanoseconds: sensors of
-    /// different vehicles do not turn in step.
+    /// A message captured at most this long after the ego's frame still counts as of its time, nanoseconds: sensors of
+    /// different vehicles are not synchronised.
     pub max_lead_nanos: u64,
     /// Messages that wait per CAV at most.
     pub depth: usize,
@@ -28,25 +28,25 @@ impl PairingConfig {
     }
 }
 
-/// A message that will not be used, and why.
+/// A message that will not be used, with the reason.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Dropped {
-    /// Who sent it.
+    /// Its sender.
     pub cav: CavId,
-    /// When it was captured, nanoseconds.
+    /// Its capture time, nanoseconds.
     pub capture_nanos: u64,
-    /// Why.
+    /// Reason for which it is not used.
     pub reason: DropReason,
 }
 
 /// A message that belongs to the ego's frame.
 #[derive(Debug, PartialEq)]
 pub struct Paired<'a, T> {
-    /// Who sent it.
+    /// Its sender.
     pub cav: &'a CavId,
     /// Capture time of the ego's frame less that of the message, nanoseconds.
     pub age_nanos: i64,
-    /// Whether it has not served an earlier frame: then it counts as received now.
+    /// True if it has not served an earlier frame: then it counts as received now.
     pub is_first_use: bool,
     /// The message.
     pub message: &'a T,
@@ -67,14 +67,14 @@ struct Waiting<T> {
 }
 
 impl<T> Pairing<T> {
-    /// Nothing waits yet.
+    /// No messages yet.
     #[must_use]
     pub fn new(config: PairingConfig) -> Self {
         Self { config, waiting: BTreeMap::new() }
     }
 
-    /// Takes a message in. What has to go for it is returned: the message itself when it came before or is older than
-    /// one that served already, or the oldest that waits when there are too many.
+    /// Queues a message. The message that has to be dropped for it is returned: the message itself when it is a
+    /// duplicate or older than one that served already, or the oldest of the queue when that is full.
     #[must_use = "what was dropped has to be counted"]
     pub fn insert(&mut self, cav: &CavId, capture_nanos: u64, message: T) -> Option<Dropped> {
         let dropped = |capture_nanos, reason| Some(Dropped { cav: cav.clone(), capture_nanos, reason });
@@ -85,7 +85,7 @@ impl<T> Pairing<T> {
         if queue.iter().any(|held| held.is_used && held.capture_nanos > capture_nanos) {
             return dropped(capture_nanos, DropReason::Superseded);
         }
-        // Messages may overtake each other on the air.
+        // Messages may be reordered by the channel.
         let place = queue.partition_point(|held| held.capture_nanos < capture_nanos);
         queue.insert(place, Waiting { capture_nanos, is_used: false, message });
         if queue.len() <= self.config.depth.max(1) {
@@ -129,14 +129,14 @@ impl<T> Pairing<T> {
         self.waiting.get(cav).into_iter().flatten().map(|held| held.capture_nanos)
     }
 
-    /// Everyone of whom something waits.
+    /// All CAVs with waiting messages.
     #[must_use]
     pub fn cavs(&self) -> Vec<CavId> {
         self.waiting.keys().cloned().collect()
     }
 
-    /// The clock of the scene was turned back to `now_nanos`: forgets what a CAV said of later times, but for what may be
-    /// `ahead_nanos` early. How many of these messages were never used.
+    /// The clock of the scene was set back to `now_nanos`: removes a CAV's messages of later times, except those up to
+    /// `ahead_nanos` early. Returns the number of these that were never used.
     pub fn turn_back(&mut self, cav: &CavId, now_nanos: u64, ahead_nanos: u64) -> usize {
         let Some(queue) = self.waiting.get_mut(cav) else { return 0 };
         let latest = now_nanos.saturating_add(ahead_nanos);
@@ -145,12 +145,12 @@ impl<T> Pairing<T> {
         unused
     }
 
-    /// Forgets a CAV that has left; how many of its messages were never used.
+    /// Removes a CAV that has left; returns the number of its messages that were never used.
     pub fn forget(&mut self, cav: &CavId) -> usize {
         self.waiting.remove(cav).map_or(0, |queue| queue.iter().filter(|held| !held.is_used).count())
     }
 
-    /// Messages that wait and were never used, at the end of a run: what the books call in flight.
+    /// Messages that wait and were never used, at the end of a run: in flight in the message accounting.
     #[must_use]
     pub fn unused(&self) -> usize {
         self.waiting.values().flatten().filter(|held| !held.is_used).count()
@@ -214,13 +214,13 @@ mod tests {
             assert_eq!((paired[0].age_nanos, paired[0].is_first_use), ((frame as i64 - 10) * FRAME as i64, first));
             assert!(dropped.is_empty());
         }
-        // It was received, so its end is no loss.
+        // It was received, so its removal is no loss.
         assert_eq!(ages(&mut pairing, 14 * FRAME), (vec![], vec![]));
         assert_eq!(pairing.unused(), 0);
     }
 
     #[test]
-    fn what_was_never_young_enough_is_stale() {
+    fn a_message_that_was_never_young_enough_is_stale() {
         let mut pairing = pairing();
         assert_eq!(pairing.insert(&cav("a"), FRAME, 1), None);
         assert_eq!(ages(&mut pairing, 9 * FRAME), (vec![], vec![DropReason::Stale]));
@@ -235,7 +235,7 @@ mod tests {
     }
 
     #[test]
-    fn duplicates_and_the_overtaken_are_told_apart() {
+    fn duplicates_and_reordered_messages_are_distinguished() {
         let mut pairing = pairing();
         assert_eq!(pairing.insert(&cav("a"), 10 * FRAME, 10), None);
         assert_eq!(pairing.insert(&cav("a"), 10 * FRAME, 10).unwrap().reason, DropReason::Duplicate);
@@ -254,9 +254,9 @@ mod tests {
     }
 
     proptest! {
-        /// Received, dropped and waiting add up to what came in, whatever comes in whatever order.
+        /// Received, dropped and waiting add up to the input, for any messages in any order.
         #[test]
-        fn the_books_balance(events in prop::collection::vec((0u64..40, 0u8..3, any::<bool>()), 0..200)) {
+        fn the_accounting_balances(events in prop::collection::vec((0u64..40, 0u8..3, any::<bool>()), 0..200)) {
             let mut pairing = pairing();
             let (mut sent, mut received, mut lost) = (0, 0, 0);
             for (frame, sender, is_message) in events {

@@ -1,7 +1,7 @@
-//! Whose maps are of another network than the ego's, by what their agents say of themselves.
+//! Peer models: detects agents whose maps come from another network than the ego's, by their descriptors.
 //!
-//! Maps of another lattice are found out one by one in any case. Those of the same lattice from other weights are not:
-//! they look sound and mean something else.
+//! Maps on another grid are rejected one by one in any case. Maps on the same grid from other weights are not: they are
+//! valid and have another meaning.
 
 use std::collections::BTreeMap;
 
@@ -9,10 +9,10 @@ use perception::detector::Detector;
 use protocol::message::{Descriptor, ModelHash};
 use protocol::{BevGrid, CavId, EncodedFeatures, WireError};
 
-/// A network that is not the ego's: the field that tells, and both values.
+/// A network that differs from the ego's: the differing field, and both values.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub(crate) enum OtherModel {
-    /// Another lattice.
+    /// Another grid.
     #[error("grid is {found}, the ego's is {own}")]
     Grid { found: BevGrid, own: BevGrid },
     /// Another number of channels.
@@ -23,10 +23,10 @@ pub(crate) enum OtherModel {
     Hash { found: ModelHash, own: ModelHash },
 }
 
-/// The ego's network, and the agents known to run another one. An agent of which nothing was heard is not among them.
+/// The ego's network, and the agents known to run another one. Agents without a descriptor are not among them.
 pub(crate) struct PeerModels {
     grid: BevGrid,
-    /// As they cross the air.
+    /// Channels as transmitted.
     channels: u32,
     code_of: Option<u32>,
     model_hash: ModelHash,
@@ -34,7 +34,7 @@ pub(crate) struct PeerModels {
 }
 
 impl PeerModels {
-    /// Nobody is known yet.
+    /// Starts with no known agents.
     pub(crate) fn new(own: &Detector) -> Self {
         Self {
             grid: own.grid(),
@@ -45,7 +45,7 @@ impl PeerModels {
         }
     }
 
-    /// Whether a map has the lattice and the channels of the ego's network.
+    /// Checks that a map has the grid and the channels of the ego's network.
     ///
     /// # Errors
     /// [`WireError`] names what differs.
@@ -53,8 +53,8 @@ impl PeerModels {
         map.check_shape(&self.grid, self.channels, self.code_of)
     }
 
-    /// Takes in what an agent says of itself; how its network differs, when that is news.
-    pub(crate) fn hear(&mut self, cav: &CavId, descriptor: &Descriptor) -> Option<OtherModel> {
+    /// Processes an agent's descriptor; returns the difference of its network when it is new.
+    pub(crate) fn update(&mut self, cav: &CavId, descriptor: &Descriptor) -> Option<OtherModel> {
         let Some(other) = self.difference(descriptor) else {
             if self.others.remove(cav).is_some() {
                 tracing::info!(%cav, "its maps are of the ego's network now");
@@ -65,18 +65,18 @@ impl PeerModels {
         (before.as_ref() != Some(&other)).then_some(other)
     }
 
-    /// Whether an agent said that its network is another one.
+    /// True if an agent's descriptor names another network.
     pub(crate) fn is_other(&self, cav: &CavId) -> bool {
         self.others.contains_key(cav)
     }
 
-    /// Forgets an agent that has left.
+    /// Removes an agent that has left.
     pub(crate) fn forget(&mut self, cav: &CavId) {
         self.others.remove(cav);
     }
 
     fn difference(&self, descriptor: &Descriptor) -> Option<OtherModel> {
-        // What it publishes and how exactly it writes is its own affair.
+        // Its streams and numeric type are not part of the network.
         let Descriptor { model_hash, grid, channels, dtype: _, streams: _ } = descriptor;
         if *grid != self.grid {
             Some(OtherModel::Grid { found: *grid, own: self.grid })
@@ -97,28 +97,28 @@ mod tests {
     use super::*;
 
     #[test]
-    fn another_network_is_news_once_and_until_it_is_the_egos() {
+    fn another_network_is_reported_once_until_it_is_the_egos() {
         let grid = BevGrid { x_min_m: -51.2, y_min_m: -38.4, cell_m: 0.8, width: 128, height: 96 };
         let own = ModelHash([7; 32]);
         let mut models = PeerModels { grid, channels: 64, code_of: None, model_hash: own, others: BTreeMap::new() };
         let cav = CavId::new("20").unwrap();
         let same = Descriptor { model_hash: own, grid, channels: 64, dtype: Dtype::I8, streams: vec![Stream::Bev] };
-        assert_eq!(models.hear(&cav, &same), None);
+        assert_eq!(models.update(&cav, &same), None);
         assert!(!models.is_other(&cav));
 
         let hash = Descriptor { model_hash: ModelHash([8; 32]), ..same.clone() };
-        let told = models.hear(&cav, &hash).unwrap().to_string();
-        assert!(told.contains("model_hash") && told.contains(&"07".repeat(32)) && told.contains(&"08".repeat(32)));
-        assert_eq!(models.hear(&cav, &hash), None, "said once");
+        let text = models.update(&cav, &hash).unwrap().to_string();
+        assert!(text.contains("model_hash") && text.contains(&"07".repeat(32)) && text.contains(&"08".repeat(32)));
+        assert_eq!(models.update(&cav, &hash), None, "reported once");
         assert!(models.is_other(&cav));
         let narrow = Descriptor { channels: 32, ..hash };
-        assert_eq!(models.hear(&cav, &narrow), Some(OtherModel::Channels { found: 32, own: 64 }));
+        assert_eq!(models.update(&cav, &narrow), Some(OtherModel::Channels { found: 32, own: 64 }));
         let wide = Descriptor { grid: BevGrid { width: 256, ..grid }, ..narrow };
-        assert!(models.hear(&cav, &wide).unwrap().to_string().starts_with("grid is "));
+        assert!(models.update(&cav, &wide).unwrap().to_string().starts_with("grid is "));
 
-        assert_eq!(models.hear(&cav, &same), None);
+        assert_eq!(models.update(&cav, &same), None);
         assert!(!models.is_other(&cav));
-        models.hear(&cav, &wide);
+        models.update(&cav, &wide);
         models.forget(&cav);
         assert!(!models.is_other(&cav));
     }

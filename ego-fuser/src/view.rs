@@ -1,31 +1,31 @@
-//! What the vehicles of a frame tell the ego.
+//! View: one vehicle's decoded message for a frame.
 
 use protocol::{CavId, DecodedFeatures, Detection, PointCloud, PoseEstimate};
 
 use fusion::method::Exchange;
 
-/// What one vehicle sees, as it arrived.
+/// One vehicle's perception as received.
 #[derive(Debug, Clone, PartialEq)]
 pub struct View {
-    /// Who.
+    /// Sender.
     pub cav: CavId,
-    /// Where it believes to be.
+    /// Pose that the sender reported.
     pub pose: PoseEstimate,
     /// Capture time of the sweep, nanoseconds.
     pub capture_nanos: u64,
-    /// What it sees, in its own LiDAR frame.
+    /// Content in the sender's own LiDAR frame.
     pub content: Content,
 }
 
 impl View {
-    /// How much older it is than another, nanoseconds.
+    /// Age relative to another view, nanoseconds.
     #[must_use]
     pub fn age_nanos(&self, newer: &Self) -> i64 {
         newer.capture_nanos as i64 - self.capture_nanos as i64
     }
 }
 
-/// What crosses the air, by method.
+/// Transmitted content, by method.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Content {
     /// A feature map: `none`, and all methods of intermediate fusion.
@@ -37,7 +37,7 @@ pub enum Content {
 }
 
 impl Content {
-    /// What has to be exchanged for it.
+    /// Exchange that transmits this content.
     #[must_use]
     pub fn exchange(&self) -> Exchange {
         match self {

@@ -1,4 +1,4 @@
-//! Messages of the wire; the fuzzer's own damage is sealed again in most cases, so that it gets past the checksums.
+//! Fuzz target of wire messages; in most cases a damaged message is sealed again, so that it passes the checksums.
 #![no_main]
 
 use libfuzzer_sys::{fuzz_mutator, fuzz_target, fuzzer_mutate};

@@ -1,6 +1,6 @@
-//! Messages to bytes and back: `stage/codec/size`, sizes in KiB of the map as `f32`.
+//! Encoding and decoding of messages: `stage/codec/size`, sizes in KiB of the feature map as `f32`.
 //!
-//! One case: `cargo bench -p protocol -- decode/f32/8192`. Every case checks once that what comes back is what went in.
+//! One case: `cargo bench -p protocol -- decode/f32/8192`. Every case checks once that decoding restores the input.
 
 use std::hint::black_box;
 
@@ -9,10 +9,10 @@ use protocol::{
     Bev, BevFeatures, BevGrid, CavId, CodecConfig, Dtype, Limits, Pose, PoseEstimate, Stamp, encode_features, wire,
 };
 
-/// A zenoh payload comes in pieces of about this size.
+/// Approximate size of the pieces of a zenoh payload, bytes.
 const PIECE_BYTES: usize = 49_152;
 
-/// 64 channels on a lattice that makes `kib` KiB of `f32`; half of the values zero, as after a ReLU.
+/// 64 channels on a grid that makes `kib` KiB of `f32`; half of the values are zero, as after a ReLU.
 fn features(kib: usize) -> BevFeatures {
     let (channels, cells) = (64, kib * 1024 / 4 / 64);
     let grid = BevGrid { x_min_m: -51.2, y_min_m: -38.4, cell_m: 0.8, width: 16, height: cells as u32 / 16 };
@@ -33,7 +33,7 @@ fn stamp() -> Stamp {
     Stamp { cav, epoch: 1, sequence: 2, capture_nanos: 3, publish_nanos: 4 }
 }
 
-/// Name and configuration of every codec; a budget is a quarter of the map in that dtype.
+/// Name and configuration of every codec; a budget is a quarter of the feature map in that dtype.
 fn codecs(kib: usize) -> Vec<(&'static str, CodecConfig)> {
     let quarter = Some(kib as u64 * 1024 / 4);
     let codec = |dtype, budget_bytes, zstd_level| CodecConfig { dtype, budget_bytes, zstd_level, gate: None };
@@ -51,7 +51,7 @@ fn codecs(kib: usize) -> Vec<(&'static str, CodecConfig)> {
 
 fn message(features: BevFeatures, config: &CodecConfig, confidence: &[f32]) -> Bev {
     let pose = PoseEstimate::new(Pose::IDENTITY, 0.5);
-    Bev { pose, features: encode_features(features, config, Some(confidence)).expect("a sound map") }
+    Bev { pose, features: encode_features(features, config, Some(confidence)).expect("a valid map") }
 }
 
 fn bench(criterion: &mut Criterion) {
@@ -61,12 +61,12 @@ fn bench(criterion: &mut Criterion) {
         let confidence = confidence(features.grid.cells());
         for (name, config) in codecs(kib) {
             let encoded =
-                wire::encode(&stamp, message(features.clone(), &config, &confidence)).expect("a sound message");
+                wire::encode(&stamp, message(features.clone(), &config, &confidence)).expect("a valid message");
             let bytes = encoded.to_vec();
             let decode = || {
                 let (_, bev) =
-                    wire::decode::<Bev>(bytes.chunks(PIECE_BYTES), &Limits::DEFAULT).expect("what was encoded");
-                bev.features.decode(&Limits::DEFAULT).expect("what was encoded")
+                    wire::decode::<Bev>(bytes.chunks(PIECE_BYTES), &Limits::DEFAULT).expect("the encoded message");
+                bev.features.decode(&Limits::DEFAULT).expect("the encoded map")
             };
             let back = decode();
             assert_eq!(back.features.values.len(), features.values.len());

@@ -1,16 +1,17 @@
-//! Who may do what: the one list from which every rule of a router is made.
+//! Permissions by role. The router's access-control rules are generated from this table.
 //!
-//! | party | publishes | hears |
+//! | principal | publishes | subscribes to |
 //! | --- | --- | --- |
 //! | `agent-<cav>` | its pose, maps, boxes, points, descriptor | its own sensors |
-//! | `ego-<cav>` | its detections | what all agents publish, directly or behind its link |
-//! | `link-<ego>` | `rx/<ego>/...` | what all agents publish, and where they are |
-//! | `replay` | every vehicle's sensors and previews of them, the truth, the end of the scene | control, who is ready, detections |
+//! | `ego-<cav>` | its detections | the streams of all agents, directly or behind its link |
+//! | `link-<ego>` | `rx/<ego>/...` | the streams of all agents, and their `gnss` poses |
+//! | `replay` | sensors of every vehicle and previews of them, the truth, the end of the scene | control, readiness, detections |
 //! | `scorer` | control | the truth, detections, poses, statistics |
 //! | `recorder` | nothing | everything but previews |
 //! | `viewer` | nothing | results, previews of sweeps, statistics |
 //!
-//! Beside that everyone says that it is there, that it is ready and how its books stand, each under its own name.
+//! In addition every process declares a liveliness token and publishes its readiness and its ledger, each under its own
+//! name.
 
 use std::fmt;
 use std::str::FromStr;
@@ -29,23 +30,23 @@ use crate::Topic;
 use crate::Verb;
 use crate::string_enum::written_as_text;
 
-/// A process as its certificate names it: `agent-4279`, `replay`.
+/// Name of a process in its certificate: `agent-4279`, `replay`.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub struct Principal {
-    /// What it does.
+    /// Role of the process.
     pub role: Role,
-    /// For which vehicle; a process without one has the name of its role.
+    /// Vehicle of the process; a process without one has the name of its role.
     pub cav: CavId,
 }
 
-/// A text that names no party.
+/// A text that names no principal.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum PrincipalError {
-    /// It begins with no role.
-    #[error("{0:?} is no party: agent-<cav>, ego-<cav>, link-<cav>, replay, scorer, recorder or viewer")]
+    /// The text begins with no role.
+    #[error("{0:?} is no principal: agent-<cav>, ego-<cav>, link-<cav>, replay, scorer, recorder or viewer")]
     Role(String),
-    /// It does not go on with a vehicle.
+    /// The role is not followed by a vehicle.
     #[error(transparent)]
     Cav(#[from] IdError),
 }
@@ -75,7 +76,7 @@ impl Principal {
         ProcessId::new(&self.to_string()).expect("two identifiers and a hyphen make one")
     }
 
-    /// All it may do in `runs`.
+    /// All permissions in `runs`.
     #[must_use]
     pub fn rights(&self, runs: &RunScope) -> Vec<Permission> {
         let keys = |topic: &dyn fmt::Display| KeyExpr::within(runs, topic);
@@ -83,7 +84,7 @@ impl Principal {
         let everyones = |stream: &dyn fmt::Display| keys(&format_args!("*/{stream}"));
         let over_link = |stream: &dyn fmt::Display| keys(&format_args!("rx/{}/*/{stream}", self.cav));
         let control = |verb| keys(&Topic::Control(verb));
-        let (publish, hear) = match self.role {
+        let (publish, subscribe) = match self.role {
             Role::Agent => {
                 let sensors = SENSORS.into_iter().map(own).chain([keys(&format_args!("{}/camera/*", self.cav))]);
                 (SHARED.map(own).into(), sensors.collect())
@@ -106,9 +107,9 @@ impl Principal {
                 )
             }
             Role::Scorer => {
-                let heard = [everyones(&Stream::Detections), everyones(&Stream::Pose)];
+                let subscribed = [everyones(&Stream::Detections), everyones(&Stream::Pose)];
                 let own = [keys(&Topic::Truth), keys(&"stats/*"), keys(&"control/*")];
-                (vec![keys(&"control/*")], own.into_iter().chain(heard).collect())
+                (vec![keys(&"control/*")], own.into_iter().chain(subscribed).collect())
             }
             Role::Recorder => (Vec::new(), vec![keys(&"**")]),
             Role::Viewer => {
@@ -122,15 +123,15 @@ impl Principal {
         let mut rights: Vec<Permission> = publish.into_iter().map(right(Operation::Publish)).collect();
         rights.push(right(Operation::Publish)(keys(&Topic::Ready(self.name()))));
         rights.push(right(Operation::Publish)(keys(&Topic::Stats(self.name()))));
-        rights.extend(hear.into_iter().map(right(Operation::Subscribe)));
+        rights.extend(subscribe.into_iter().map(right(Operation::Subscribe)));
         rights
             .push(right(Operation::DeclareLiveliness)(keys(&Topic::Alive { role: self.role, cav: self.cav.clone() })));
         rights.extend(self.watched().map(|topic| right(Operation::SubscribeLiveliness)(keys(&topic))));
-        rights.push(right(Operation::Query)(keys(&crate::key::NOBODY)));
+        rights.push(right(Operation::Query)(keys(&crate::key::UNDECLARED)));
         rights
     }
 
-    /// Whose coming and going it follows.
+    /// Liveliness tokens that this role subscribes to, below the run.
     fn watched(&self) -> Option<&'static str> {
         match self.role {
             Role::Ego | Role::Link => Some("alive/agent/*"),
@@ -140,23 +141,23 @@ impl Principal {
     }
 }
 
-/// Keys of which no message has more than so many bytes, in whatever run.
+/// Limits of message sizes, bytes, by key, in any run.
 #[must_use]
 pub fn size_limits() -> Vec<(Vec<KeyExpr>, usize)> {
     let small = [Stream::Pose, Stream::Gnss, Stream::Preview, Stream::Descriptor, Stream::Boxes, Stream::Detections];
     let keys = |stream| [format!("*/{stream}"), format!("rx/*/*/{stream}")];
     let selectors = |topics: Vec<String>| topics.iter().map(|topics| KeyExpr::within(&RunScope::Any, topics)).collect();
     let limit = |stream: Stream| Some((selectors(keys(stream).into()), stream.most_bytes()?));
-    let talk = ["control/*", "ready/*", "stats/*"].map(str::to_owned).into();
-    let talk = (selectors(talk), 2 * Limits::HARD_METADATA_BYTES as usize);
-    small.into_iter().filter_map(limit).chain([talk]).collect()
+    let small_messages = ["control/*", "ready/*", "stats/*"].map(str::to_owned).into();
+    let small_messages = (selectors(small_messages), 2 * Limits::HARD_METADATA_BYTES as usize);
+    small.into_iter().filter_map(limit).chain([small_messages]).collect()
 }
 
-/// What the replay publishes for vehicles, cameras apart.
+/// Streams that the replay publishes for vehicles, without cameras.
 const SENSORS: [Stream; 3] = [Stream::Lidar, Stream::Gnss, Stream::Radar];
-/// What agents tell each other.
+/// Streams of agents.
 const SHARED: [Stream; 5] = [Stream::Pose, Stream::Bev, Stream::Boxes, Stream::Points, Stream::Descriptor];
-/// What an ego tells everyone.
+/// Streams of an ego for all principals.
 const DETECTIONS: [Stream; 2] = [Stream::Detections, Stream::DetectionsJson];
 
 impl fmt::Display for Principal {
@@ -184,12 +185,12 @@ impl FromStr for Principal {
 
 written_as_text!(Principal);
 
-/// In which runs rights hold.
+/// Runs in which permissions hold.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum RunScope {
-    /// This one.
+    /// One run.
     One(RunId),
-    /// Whatever they are called: for a router that outlives runs.
+    /// Any run: for a router that outlives runs.
     Any,
 }
 
@@ -202,7 +203,7 @@ impl fmt::Display for RunScope {
     }
 }
 
-/// What a party may do with keys.
+/// Operation of a principal on keys.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Operation {
     /// Put messages.
@@ -223,12 +224,12 @@ impl Operation {
         [Self::Publish, Self::Subscribe, Self::DeclareLiveliness, Self::SubscribeLiveliness, Self::Query];
 }
 
-/// One thing that a party may do.
+/// One operation that a principal may carry out.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Permission {
-    /// What.
+    /// Permitted operation.
     pub act: Operation,
-    /// With which keys.
+    /// Keys on which it is permitted.
     pub keys: KeyExpr,
 }
 
@@ -236,17 +237,17 @@ pub struct Permission {
 mod tests {
     use super::*;
 
-    fn rights(party: &str, act: Operation) -> Vec<String> {
+    fn rights(principal: &str, act: Operation) -> Vec<String> {
         let runs = RunScope::One(RunId::new("r1").unwrap());
-        let rights = party.parse::<Principal>().unwrap().rights(&runs);
+        let rights = principal.parse::<Principal>().unwrap().rights(&runs);
         rights.iter().filter(|right| right.act == act).map(|right| right.keys.to_string()).collect()
     }
 
     #[test]
-    fn parties_are_written_and_read_back() {
+    fn principals_are_written_and_read_back() {
         for text in ["agent-4279", "agent--1", "ego-4279", "link-4279", "replay", "scorer", "recorder", "viewer"] {
-            let party: Principal = text.parse().unwrap();
-            assert_eq!((party.to_string().as_str(), party.name().as_str()), (text, text));
+            let principal: Principal = text.parse().unwrap();
+            assert_eq!((principal.to_string().as_str(), principal.name().as_str()), (text, text));
         }
         for text in ["", "router", "agent-*", "agent-truth", "agent-4279/bev", "driver-1"] {
             assert!(text.parse::<Principal>().is_err(), "{text}");
@@ -254,12 +255,16 @@ mod tests {
     }
 
     #[test]
-    fn a_vehicle_publishes_under_its_own_name_alone() {
-        for party in ["agent-4279", "ego-4279"] {
-            for keys in rights(party, Operation::Publish) {
-                let own = ["v2v/r1/4279/".to_owned(), format!("v2v/r1/stats/{party}"), format!("v2v/r1/ready/{party}")];
-                assert!(own.iter().any(|own| keys.starts_with(own)), "{party}: {keys}");
-                assert!(!keys.contains('*'), "{party}: {keys}");
+    fn a_vehicle_publishes_only_under_its_own_name() {
+        for principal in ["agent-4279", "ego-4279"] {
+            for keys in rights(principal, Operation::Publish) {
+                let own = [
+                    "v2v/r1/4279/".to_owned(),
+                    format!("v2v/r1/stats/{principal}"),
+                    format!("v2v/r1/ready/{principal}"),
+                ];
+                assert!(own.iter().any(|own| keys.starts_with(own)), "{principal}: {keys}");
+                assert!(!keys.contains('*'), "{principal}: {keys}");
             }
         }
         assert!(rights("link-4279", Operation::Publish).contains(&"v2v/r1/rx/4279/*/bev".to_owned()));
@@ -267,10 +272,10 @@ mod tests {
     }
 
     #[test]
-    fn agents_never_hear_the_truth_or_each_other() {
+    fn agents_never_subscribe_to_the_truth_or_to_each_other() {
         assert!(rights("agent-4279", Operation::Subscribe).iter().all(|keys| keys.starts_with("v2v/r1/4279/")));
-        for party in ["agent-4279", "ego-4279", "link-4279"] {
-            assert!(!rights(party, Operation::Subscribe).contains(&"v2v/r1/truth".to_owned()), "{party}");
+        for principal in ["agent-4279", "ego-4279", "link-4279"] {
+            assert!(!rights(principal, Operation::Subscribe).contains(&"v2v/r1/truth".to_owned()), "{principal}");
         }
     }
 

@@ -1,4 +1,4 @@
-//! Bird's-eye-view feature maps and the lattice they lie on.
+//! Bird's-eye-view (BEV) feature maps and the grid of their cells.
 
 use std::fmt;
 
@@ -7,12 +7,12 @@ use serde::{Deserialize, Serialize};
 use crate::Limits;
 use crate::WireError;
 
-/// Bounds of a lattice's edges, metres: far beyond any sensor.
+/// Bound of the edges of a grid, metres: far beyond any sensor.
 const MAX_EDGE_M: f64 = 1e4;
 /// Bounds of a cell's edge, metres.
 const CELL_RANGE_M: (f64, f64) = (1e-3, 1e3);
 
-/// The lattice of a BEV map in a LiDAR frame: where its first cell begins, how large cells are, how many there are.
+/// BEV grid in a LiDAR frame: lower edges, cell size and number of cells.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct BevGrid {
     /// Lower edge of column 0, metres.
@@ -34,7 +34,7 @@ impl BevGrid {
         self.width as usize * self.height as usize
     }
 
-    /// The same area with cells `factor` times as large; partial cells at the upper edges count as whole ones.
+    /// The same area with cells `factor` times as large; partial cells at the upper edges count as whole cells.
     #[must_use]
     pub fn downsampled(&self, factor: u32) -> Self {
         Self {
@@ -45,11 +45,10 @@ impl BevGrid {
         }
     }
 
-    /// Checks a lattice from outside.
+    /// Checks a grid from outside.
     ///
-    /// # Errors
     /// [`WireError::Value`] for an edge that is not a finite number of plausible size, [`WireError::Limit`] for more
-    /// cells than are taken, [`WireError::Shape`] for none.
+    /// cells than permitted, [`WireError::Shape`] for none.
     pub fn check(&self, limits: &Limits) -> Result<(), WireError> {
         let Self { x_min_m, y_min_m, cell_m, width, height } = *self;
         let (cell_min, cell_max) = CELL_RANGE_M;
@@ -79,15 +78,15 @@ impl fmt::Display for BevGrid {
     }
 }
 
-/// A feature map: `[C, H, W]` `f32`, row-major, on `grid` in the frame of the CAV that made it.
+/// BEV feature map: `[C, H, W]` `f32`, row-major, on `grid` in the frame of the CAV that made it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct BevFeatures {
-    /// The lattice.
+    /// BEV grid.
     pub grid: BevGrid,
     /// Number of channels `C`.
     pub channels: u32,
-    /// Channels of the map that the sender's network has squeezed into these, and the receiver's widens again; absent: this
-    /// is the map.
+    /// Channels of the feature map before the sender's learnt compressor, which the receiver's decoder restores;
+    /// absent: not compressed.
     pub code_of: Option<u32>,
     /// `C * H * W` values.
     pub values: Vec<f32>,

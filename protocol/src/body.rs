@@ -8,15 +8,16 @@ use crate::WireError;
 #[cfg(target_endian = "big")]
 compile_error!("message bodies are little-endian in memory; a big-endian target would need a converting copy");
 
-/// Copied and checked at a time: stays in the first-level cache for every pass over it. Whole values of every kind.
+/// Bytes copied and checked at a time: a block stays in the first-level cache for every pass over it. Whole values of
+/// every kind.
 const BLOCK_BYTES: usize = 8 << 10;
 
-/// The body of one message, owned, in the type its values have.
+/// The body of one message, owned, in the type of its values.
 ///
-/// As bytes (`AsRef<[u8]>`) it goes on the wire without a copy, for example through `bytes::Bytes::from_owner`.
+/// As bytes (`AsRef<[u8]>`) it is transmitted without a copy, for example through `bytes::Bytes::from_owner`.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub enum Body {
-    /// Nothing.
+    /// No body.
     #[default]
     Empty,
     /// Bytes of a codec.
@@ -45,7 +46,7 @@ impl Body {
         self.as_bytes().len()
     }
 
-    /// Whether there are none.
+    /// True if the body has no bytes.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.len() == 0
@@ -58,7 +59,7 @@ impl AsRef<[u8]> for Body {
     }
 }
 
-/// What metadata demand of the body, before a byte of it is read.
+/// Shape of the body that the metadata require, known before the body is read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum BodyShape {
     /// No body.
@@ -98,7 +99,7 @@ fn exactly(count: u64, size: u64) -> (u64, u64) {
     count.checked_mul(size).map_or((u64::MAX, 0), |bytes| (bytes, bytes))
 }
 
-/// Reads a payload that lies in many pieces, front to back, feeding the checksum.
+/// Reads a payload that consists of many pieces, front to back, and updates the checksum.
 pub(crate) struct PayloadReader<'a> {
     pieces: std::vec::IntoIter<&'a [u8]>,
     piece: &'a [u8],
@@ -117,7 +118,7 @@ impl<'a> PayloadReader<'a> {
         reader
     }
 
-    /// The next bytes that lie together, at most `max`; `None` at the end.
+    /// The next contiguous bytes, at most `max`; `None` at the end.
     fn next_run(&mut self, max: usize) -> Option<&'a [u8]> {
         while self.piece.is_empty() {
             self.piece = self.pieces.next()?;
@@ -127,7 +128,7 @@ impl<'a> PayloadReader<'a> {
         Some(run)
     }
 
-    /// The next `len` bytes, which the caller knows to be there.
+    /// The next `len` bytes; the caller has checked that they are there.
     pub(crate) fn read_bytes(&mut self, len: usize) -> Vec<u8> {
         let mut out = Vec::with_capacity(len);
         while out.len() < len {
@@ -138,10 +139,11 @@ impl<'a> PayloadReader<'a> {
         out
     }
 
-    /// The body, `len` bytes that the caller knows to be there, as `shape` says, and whether all its values are sound.
+    /// The body, `len` bytes that the caller has checked to be there, in the given `shape`, and true if all its values
+    /// are finite and bounded.
     ///
     /// # Errors
-    /// [`WireError::Shape`] when the length is not the shape's.
+    /// [`WireError::Shape`] when the length does not match the shape.
     pub(crate) fn read_body(&mut self, len: u64, shape: BodyShape, max_abs: f32) -> Result<(Body, bool), WireError> {
         shape.check(len)?;
         let len = len as usize;
@@ -149,22 +151,22 @@ impl<'a> PayloadReader<'a> {
             BodyShape::Empty => (Body::Empty, true),
             BodyShape::Bytes { .. } => (Body::Bytes(self.read_bytes(len)), true),
             BodyShape::Floats(_) => {
-                let (values, sound) = self.read_values::<1>(len, max_abs);
-                (Body::Floats(values.into_flattened()), sound)
+                let (values, valid) = self.read_values::<1>(len, max_abs);
+                (Body::Floats(values.into_flattened()), valid)
             }
             BodyShape::Points(_) => {
-                let (points, sound) = self.read_values(len, max_abs);
-                (Body::Points(points), sound)
+                let (points, valid) = self.read_values(len, max_abs);
+                (Body::Points(points), valid)
             }
         })
     }
 
-    /// `len` bytes as values of `N` numbers: the one copy from the network's pieces into aligned memory, and whether every
-    /// number is sound.
+    /// `len` bytes as values of `N` numbers: the only copy from the network's pieces into aligned memory, and true if
+    /// every number is finite and bounded.
     ///
-    /// Block by block, so that what comes from another core's memory is read once: the second pass over a block, which
-    /// checks and copies at once, finds it in the first-level cache. Only a value that lies across two pieces goes round
-    /// by the stack.
+    /// Works block by block, so that memory of another core is read once: the second pass over a block, which checks
+    /// and copies in one step, finds it in the first-level cache. Only a value that spans two pieces is copied through
+    /// the stack.
     fn read_values<const N: usize>(&mut self, len: usize, max_abs: f32) -> (Vec<[f32; N]>, bool) {
         let value_bytes = size_of::<[f32; N]>();
         let headroom = headroom(max_abs);
@@ -208,7 +210,7 @@ impl<'a> PayloadReader<'a> {
         true
     }
 
-    /// The checksum over all bytes of the payload, those not yet read included.
+    /// The checksum over all bytes of the payload, including those not yet read.
     pub(crate) fn finish(mut self) -> u32 {
         while let Some(run) = self.next_run(usize::MAX) {
             self.crc.update(run);
@@ -217,7 +219,7 @@ impl<'a> PayloadReader<'a> {
     }
 }
 
-/// Names the first value of a tensor that is not finite or larger than `max_abs`.
+/// Reports the first value of a tensor that is not finite or exceeds `max_abs`.
 pub(crate) fn check_body(body: &Body, max_abs: f32) -> Result<(), WireError> {
     match body {
         Body::Floats(values) => check_values("feature", values, max_abs),
@@ -226,28 +228,29 @@ pub(crate) fn check_body(body: &Body, max_abs: f32) -> Result<(), WireError> {
     }
 }
 
-/// Whether every value is finite and at most `max_abs` in size.
+/// True if every value is finite and at most `max_abs` in absolute value.
 pub(crate) fn all_bounded(values: &[f32], max_abs: f32) -> bool {
     let headroom = headroom(max_abs);
     values.iter().fold(0, |excess, value| excess | excess_over(headroom, *value)) >= 0
 }
 
-/// How far the bits of `max_abs` are from the largest integer.
+/// Distance of the bits of `max_abs` from the largest integer.
 #[inline]
 fn headroom(max_abs: f32) -> i32 {
     i32::MAX - max_abs.abs().to_bits() as i32
 }
 
-/// Negative where `number` is NaN, infinite or larger in size than the number that `headroom` was made of.
+/// Negative if `number` is NaN, infinite or larger in absolute value than the number from which `headroom` was
+/// computed.
 ///
-/// Without their sign, bit patterns have the order of the numbers, and those of infinity and NaN come after all: one
-/// integer addition, which overflows into the sign, tells all three.
+/// Without their sign, bit patterns have the order of the numbers, and those of infinity and NaN are the largest: one
+/// integer addition, which overflows into the sign, detects all three.
 #[inline]
 fn excess_over(headroom: i32, number: f32) -> i32 {
     (number.abs().to_bits() as i32).wrapping_add(headroom)
 }
 
-/// [`all_bounded`], naming the first value that is not.
+/// [`all_bounded`] with an error for the first value that is not.
 pub(crate) fn check_values(what: &'static str, values: &[f32], max_abs: f32) -> Result<(), WireError> {
     if all_bounded(values, max_abs) {
         return Ok(());
@@ -280,8 +283,8 @@ mod tests {
         let bytes = body.as_bytes().to_vec();
         for size in [1, 2, 3, 5, 7, 16, 4095, 16 << 10, 65_535, 1 << 20] {
             let mut reader = split(&bytes, size);
-            let (read, sound) = reader.read_body(40_000, BodyShape::Floats(10_000), 1e6).unwrap();
-            assert!(sound && read == body, "pieces of {size}");
+            let (read, valid) = reader.read_body(40_000, BodyShape::Floats(10_000), 1e6).unwrap();
+            assert!(valid && read == body, "pieces of {size}");
             assert_eq!(reader.finish(), crc32fast::hash(&bytes));
             let (read, _) = split(&bytes, size).read_body(40_000, BodyShape::Points(2_500), 1e6).unwrap();
             assert_eq!(read.as_bytes(), bytes);
@@ -289,7 +292,7 @@ mod tests {
     }
 
     #[test]
-    fn a_length_that_is_not_the_shape_s_is_refused() {
+    fn a_length_that_does_not_match_the_shape_is_refused() {
         for (shape, len) in [
             (BodyShape::Empty, 1),
             (BodyShape::Floats(2), 7),

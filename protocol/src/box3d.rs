@@ -1,4 +1,4 @@
-//! Oriented boxes and what a detector says of them.
+//! Oriented boxes and detections.
 
 use nalgebra::{Isometry3, Point3, Vector3};
 use serde::{Deserialize, Serialize};
@@ -12,7 +12,7 @@ pub struct Box3d {
     pub center_m: [f64; 3],
     /// Full length (along the heading), width and height in metres.
     pub size_m: [f64; 3],
-    /// Turn about z from x towards y, radians.
+    /// Rotation about z from x towards y, radians.
     pub heading_rad: f64,
 }
 
@@ -52,12 +52,12 @@ impl Box3d {
 /// A box that a detector reports.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Detection {
-    /// Where, in the ego's LiDAR frame.
+    /// Box in the ego's LiDAR frame.
     #[serde(rename = "box")]
     pub box3d: Box3d,
     /// Confidence, 0..1.
     pub score: f32,
-    /// The CAV that saw it, where one alone did (late fusion).
+    /// The CAV that detected it, if a single one did (late fusion).
     pub source: Option<CavId>,
 }
 

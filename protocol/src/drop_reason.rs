@@ -1,51 +1,51 @@
-//! Why messages are lost.
+//! Reasons for which messages are dropped.
 
 use crate::string_enum::named;
 
 named! {
-    /// Why a message was not used.
+    /// Reason for which a message was not used.
     pub enum DropReason {
-        /// Lost on the emulated air.
+        /// Lost on the emulated link.
         LinkLoss = "link_loss",
-        /// The emulated air's queue was full.
+        /// The queue of the emulated link was full.
         LinkQueue = "link_queue",
-        /// A newer one took its place before it was used.
+        /// Replaced by a newer message before it was used.
         Superseded = "superseded",
-        /// Too old when it came.
+        /// Too old on arrival.
         Stale = "stale",
-        /// The same one had come before.
+        /// The same message had arrived before.
         Duplicate = "duplicate",
         /// Not a message, or not of this kind.
         Decode = "decode",
-        /// Changed on the way.
+        /// Corrupted in transit.
         Checksum = "checksum",
-        /// Sizes that do not agree with each other, with what was announced, or with the limits; maps of another
+        /// Sizes that do not agree with each other, with the announcement, or with the limits; feature maps of another
         /// network.
         Shape = "shape",
         /// A value that is NaN, infinite or out of bounds.
         NotFinite = "not_finite",
-        /// Sent under another's name.
+        /// Sender in the header differs from the owner of the key.
         Identity = "identity",
-        /// Of another wire version.
+        /// Other wire version.
         Version = "version",
-        /// Sender or receiver does not know where it is.
+        /// Sender or receiver has no pose.
         NoPose = "no_pose",
-        /// From a vehicle farther away than vehicles talk to each other.
+        /// Sender is beyond the communication range.
         OutOfRange = "out_of_range",
-        /// Who sent it, was to have it or carried it was away for a while, and nobody can tell what became of it.
+        /// Sender, receiver or link was offline for a while; the message cannot be accounted for.
         PeerOffline = "peer_offline",
-        /// Of a time that has not come yet.
+        /// Capture time is in the future.
         Future = "future",
-        /// From a vehicle whose words do not fit what the ego sees itself.
+        /// Sender was excluded by misbehaviour detection.
         Distrusted = "distrusted",
-        /// More than its sender may send in that time.
+        /// Exceeds the rate limit of its sender.
         RateLimit = "rate_limit",
     }
 }
 
 impl DropReason {
-    /// Whether data were lost that should have been used: not by what the air does to them, and not for being rightly
-    /// left out.
+    /// True if data were lost that should have been used: not by the emulated link, and not because they were rightly
+    /// rejected.
     #[must_use]
     pub fn is_loss(self) -> bool {
         !matches!(self, Self::LinkLoss | Self::LinkQueue | Self::OutOfRange | Self::Distrusted)

@@ -1,12 +1,13 @@
-//! What can be wrong with a message, and under which reason its loss is counted.
+//! Errors of messages, and the drop reason under which each is counted.
 
 use crate::CavId;
 use crate::DropReason;
 use crate::IdError;
+use crate::Kind;
 use crate::PoseError;
-use crate::header::{HEADER_LEN, Kind, MAGIC, WIRE_VERSION};
+use crate::header::{HEADER_LEN, MAGIC, WIRE_VERSION};
 
-/// Why bytes are not a message, or values cannot become one.
+/// Error of decoding or encoding a message.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum WireError {
     /// Fewer bytes than a header, or than the header announces.
@@ -14,7 +15,7 @@ pub enum WireError {
     Truncated {
         /// Bytes needed.
         expected: u64,
-        /// Bytes there.
+        /// Bytes found.
         found: u64,
     },
     /// More bytes than the header announces.
@@ -22,7 +23,7 @@ pub enum WireError {
     TrailingBytes {
         /// Bytes announced.
         expected: u64,
-        /// Bytes there.
+        /// Bytes found.
         found: u64,
     },
     /// Not a message of this program.
@@ -31,22 +32,22 @@ pub enum WireError {
         /// The first four bytes.
         found: [u8; 4],
     },
-    /// A message of another version.
-    #[error("message is of wire version {found}, this program speaks {WIRE_VERSION}")]
+    /// A message of another wire version.
+    #[error("message is of wire version {found}, this program supports {WIRE_VERSION}")]
     Version {
-        /// Its version.
+        /// Version found.
         found: u16,
     },
-    /// A number that names no kind.
+    /// A number that is no message kind.
     #[error("message is of the unknown kind {found}")]
     UnknownKind {
-        /// The number.
+        /// Number found.
         found: u8,
     },
     /// A message of another kind than this key carries.
     #[error("message is of kind {found}, expected {expected}")]
     Kind {
-        /// Kind that belongs here.
+        /// Kind that belongs to the key.
         expected: Kind,
         /// Kind in the header.
         found: Kind,
@@ -55,14 +56,14 @@ pub enum WireError {
     #[error("header names no CAV: {0}")]
     Cav(#[source] IdError),
     /// Header and key (or certificate) name different vehicles.
-    #[error("message of CAV {found} came under the name of CAV {expected}")]
+    #[error("message names CAV {found} as its sender, its key names CAV {expected}")]
     Identity {
-        /// Who the key says is speaking.
+        /// Sender named in the key.
         expected: CavId,
-        /// Who the header says is speaking.
+        /// Sender named in the header.
         found: CavId,
     },
-    /// The first {HEADER_LEN} bytes were changed on the way.
+    /// The first {HEADER_LEN} bytes were corrupted in transit.
     #[error("header checksum is {found:08x}, its {HEADER_LEN} bytes give {expected:08x}")]
     HeaderChecksum {
         /// Computed here.
@@ -70,7 +71,7 @@ pub enum WireError {
         /// Carried by the message.
         found: u32,
     },
-    /// Metadata or body were changed on the way.
+    /// Metadata or body were corrupted in transit.
     #[error("payload checksum is {found:08x}, the bytes give {expected:08x}")]
     Checksum {
         /// Computed here.
@@ -83,43 +84,43 @@ pub enum WireError {
     Metadata {
         /// Kind of the message.
         kind: Kind,
-        /// What the decoder says.
+        /// Error text of the decoder.
         detail: String,
     },
-    /// More than the receiver takes.
-    #[error("{what}: {found}, at most {max} are taken")]
+    /// More than the receiver permits.
+    #[error("{what}: {found}, at most {max} are permitted")]
     Limit {
-        /// What is counted.
+        /// Quantity that is limited.
         what: &'static str,
         /// The limit.
         max: u64,
-        /// How much the message has, or claims.
+        /// Value found in the message, or claimed by it.
         found: u64,
     },
     /// Two sizes that have to agree do not.
     #[error("{what}: {found}, expected {expected}")]
     Shape {
-        /// Which size.
+        /// Name of the size.
         what: &'static str,
-        /// What it has to be.
+        /// Required size.
         expected: u64,
-        /// What it is.
+        /// Size found.
         found: u64,
     },
-    /// The lattice is not the one that was agreed on.
-    #[error("feature map lies on {found}, expected {expected}")]
+    /// The grid is not the agreed one.
+    #[error("feature map has the grid {found}, expected {expected}")]
     Grid {
-        /// The agreed lattice.
+        /// The agreed grid.
         expected: String,
-        /// The message's lattice.
+        /// Grid of the message.
         found: String,
     },
     /// A number that is NaN, infinite or beyond its bounds.
     #[error("{what}[{index}] is {value}, not a number within {min}..={max}")]
     Value {
-        /// Which field.
+        /// Name of the field.
         what: &'static str,
-        /// Where in it; 0 for a scalar.
+        /// Index in the field; 0 for a scalar.
         index: usize,
         /// The number.
         value: f64,
@@ -128,30 +129,30 @@ pub enum WireError {
         /// Upper bound.
         max: f64,
     },
-    /// Numbers that are no pose.
+    /// Numbers that are not a valid pose.
     #[error("{what}: {source}")]
     Pose {
-        /// Which pose.
+        /// Name of the pose.
         what: &'static str,
-        /// What is wrong with it.
+        /// Error of the pose.
         source: PoseError,
     },
-    /// A compressed body that does not unpack to what it announces.
+    /// A compressed body that does not decompress to the announced size.
     #[error("compressed body of {bytes} bytes, {expected} unpacked: {detail}")]
     Compression {
         /// Compressed size.
         bytes: u64,
-        /// Size that shape and codec demand of the unpacked body.
+        /// Size that shape and codec require of the decompressed body.
         expected: u64,
-        /// What the decoder says.
+        /// Error text of the decoder.
         detail: String,
     },
-    /// A byte budget that cannot hold the parts every selection has.
+    /// A byte budget that cannot hold the parts of an empty selection.
     #[error("budget of {budget} bytes cannot hold scales and cell mask, which take {needed}")]
     Budget {
         /// The configured budget.
         budget: u64,
-        /// The least that any selection takes.
+        /// Size of an empty selection.
         needed: u64,
     },
     /// Cells cannot be selected without a confidence for each.
@@ -163,7 +164,7 @@ pub enum WireError {
 }
 
 impl WireError {
-    /// The reason under which the ledger counts a message lost to this error.
+    /// Drop reason under which the ledger counts a message lost to this error.
     #[must_use]
     pub fn drop_reason(&self) -> DropReason {
         match self {

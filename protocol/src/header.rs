@@ -1,6 +1,6 @@
-//! The fixed-size header every message starts with.
+//! Fixed-size header at the start of every message.
 //!
-//! It can be read, and trusted, without touching what follows: it carries its own checksum beside that of the payload.
+//! It can be read and verified without the rest of the message: it carries its own checksum beside that of the payload.
 //!
 //! | offset | bytes | field |
 //! | ---: | ---: | --- |
@@ -20,117 +20,44 @@
 //!
 //! All numbers are little-endian. Metadata follow, then the body, then nothing.
 
-use std::fmt;
-
 use serde::{Deserialize, Serialize};
 
 use crate::CavId;
 use crate::IdError;
+use crate::Kind;
 use crate::WireError;
 
 /// First four bytes of every message.
 pub const MAGIC: [u8; 4] = *b"V2VL";
-/// Version of everything on the wire; any change of layout or metadata raises it.
+/// Version of the whole wire format; any change of layout or metadata raises it.
 pub const WIRE_VERSION: u16 = 4;
 /// Bytes of a header.
 pub const HEADER_LEN: usize = 92;
 
 const CRC_OFFSET: usize = HEADER_LEN - 4;
 
-/// What a message is. The numbers are on the wire: never reuse one.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-#[repr(u8)]
-pub enum Kind {
-    /// A LiDAR sweep, replay to agent.
-    Lidar = 1,
-    /// A radar sweep, replay to agent.
-    Radar = 2,
-    /// A recorded or GNSS pose, replay to agent.
-    Gnss = 3,
-    /// A pose estimate, agent to ego.
-    Pose = 4,
-    /// A BEV feature map, agent to ego (intermediate fusion).
-    Bev = 5,
-    /// Detections of one agent, agent to ego (late fusion).
-    Boxes = 6,
-    /// Points of one agent, agent to ego (early fusion).
-    Points = 7,
-    /// What an agent is going to send, agent to ego.
-    Descriptor = 8,
-    /// What the ego detected, ego to anyone.
-    Detections = 9,
-    /// True poses and objects, replay to scorer.
-    Truth = 10,
-    /// Start, stop, readiness, operator to all.
-    Control = 11,
-    /// Ledger and stage timings, any process to the operator.
-    Stats = 12,
-}
-
-impl Kind {
-    /// Every kind, by number.
-    pub const ALL: [Self; 12] = [
-        Self::Lidar,
-        Self::Radar,
-        Self::Gnss,
-        Self::Pose,
-        Self::Bev,
-        Self::Boxes,
-        Self::Points,
-        Self::Descriptor,
-        Self::Detections,
-        Self::Truth,
-        Self::Control,
-        Self::Stats,
-    ];
-
-    fn from_wire(found: u8) -> Result<Self, WireError> {
-        Self::ALL.into_iter().find(|kind| *kind as u8 == found).ok_or(WireError::UnknownKind { found })
-    }
-}
-
-impl fmt::Display for Kind {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            Self::Lidar => "lidar",
-            Self::Radar => "radar",
-            Self::Gnss => "gnss",
-            Self::Pose => "pose",
-            Self::Bev => "bev",
-            Self::Boxes => "boxes",
-            Self::Points => "points",
-            Self::Descriptor => "descriptor",
-            Self::Detections => "detections",
-            Self::Truth => "truth",
-            Self::Control => "control",
-            Self::Stats => "stats",
-        })
-    }
-}
-
-/// Who sends a message, which one it is, and when: what the sender has to say beside the message itself.
+/// Identity and times of a message: sender, sequence number, capture and publish time.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub struct Stamp {
-    /// The vehicle that speaks, or that a sensor message belongs to. Processes without a vehicle use a name of their
+    /// The vehicle that sends, or that a sensor message belongs to. Processes without a vehicle use a name of their
     /// own, for example `replay`.
     pub cav: CavId,
-    /// Chosen at random when the sender started: tells a restarted sender from an old one.
+    /// Random number of the process instance: distinguishes a restarted sender from its previous instance.
     pub epoch: u64,
-    /// Strictly rising within an epoch and stream.
+    /// Strictly increasing within an epoch and stream.
     pub sequence: u64,
-    /// When what it tells of was measured, nanoseconds on the scene's clock.
+    /// Capture time of the content, nanoseconds on the scene's clock.
     pub capture_nanos: u64,
-    /// When it was handed to the network, nanoseconds: Unix clock, or the scene's in stepped runs.
+    /// Time of handing over to the network, nanoseconds: Unix clock, or the scene's in stepped runs.
     pub publish_nanos: u64,
 }
 
 /// The decoded header.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Header {
-    /// What the message is.
+    /// Kind of the message.
     pub kind: Kind,
-    /// Who, which and when.
+    /// Identity and times.
     pub stamp: Stamp,
     /// Bytes of metadata.
     pub metadata_len: u32,
@@ -141,7 +68,7 @@ pub struct Header {
 }
 
 impl Header {
-    /// The header as it goes on the wire.
+    /// The header as it is transmitted.
     #[must_use]
     pub fn to_bytes(&self) -> [u8; HEADER_LEN] {
         // Destructured in full, so that a new field stops the build here.
@@ -166,10 +93,10 @@ impl Header {
         bytes
     }
 
-    /// Reads a header; says nothing yet of the payload.
+    /// Reads a header; the payload is not checked.
     ///
     /// # Errors
-    /// [`WireError`] when it is no header of this version, was changed on the way, or names no kind or vehicle.
+    /// [`WireError`] when it is no header of this version, was corrupted in transit, or names no kind or vehicle.
     pub fn from_bytes(bytes: &[u8; HEADER_LEN]) -> Result<Self, WireError> {
         let magic = take::<4>(bytes, 0);
         if magic != MAGIC {
@@ -201,10 +128,10 @@ impl Header {
         })
     }
 
-    /// Checks that the message speaks for the vehicle under whose key it came.
+    /// Checks that the sender in the header is the vehicle that owns the key.
     ///
     /// # Errors
-    /// [`WireError::Identity`] names both.
+    /// [`WireError::Identity`] states both.
     pub fn check_sender(&self, expected: &CavId) -> Result<(), WireError> {
         if self.stamp.cav == *expected {
             return Ok(());
@@ -217,7 +144,7 @@ fn take<const N: usize>(bytes: &[u8; HEADER_LEN], offset: usize) -> [u8; N] {
     std::array::from_fn(|index| bytes[offset + index])
 }
 
-/// One vehicle has exactly one spelling: what follows the name must be zero.
+/// One vehicle has exactly one encoding: the bytes after the name must be zero.
 fn cav_from_wire(len: u8, field: &[u8; CavId::MAX_LEN]) -> Result<CavId, WireError> {
     let (name, padding) = field.split_at(usize::from(len).min(field.len()));
     let text = String::from_utf8_lossy(name);
@@ -257,7 +184,7 @@ mod tests {
     }
 
     #[test]
-    fn bytes_are_what_they_always_were() {
+    fn bytes_are_stable() {
         let mut golden = Vec::new();
         golden.extend(b"V2VL");
         golden.extend([4, 0, 5, 4]);
@@ -286,7 +213,7 @@ mod tests {
     }
 
     #[test]
-    fn says_what_is_wrong() {
+    fn errors_state_the_cause() {
         assert!(matches!(resealed(|b| b[0] = b'X'), Err(WireError::Magic { found: [b'X', ..] })));
         assert!(matches!(resealed(|b| b[4] = 7), Err(WireError::Version { found: 7 })));
         assert!(matches!(resealed(|b| b[6] = 99), Err(WireError::UnknownKind { found: 99 })));

@@ -1,22 +1,23 @@
-//! Checked identifiers: what may stand in a key of the network.
+//! Checked identifiers: names that are valid chunks of a key.
 
 use std::fmt;
 use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
-/// Words that stand in a key where a CAV could: a vehicle of that name would publish onto somebody else's key.
+/// Reserved chunks at the position of a CAV in a key: a vehicle of that name would publish onto a key of another
+/// process.
 pub(crate) const RESERVED_CAV_IDS: [&str; 6] = ["alive", "control", "ready", "rx", "stats", "truth"];
 
-/// Why a text is not an identifier.
+/// Error of a text that is not an identifier.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum IdError {
     /// Empty, too long, or a character outside the alphabet.
     #[error("{kind} {text:?} is not an identifier: 1 to {max_len} characters of a-z, 0-9, '_' and '-'")]
     Malformed {
-        /// What the text was to name.
+        /// Kind of identifier.
         kind: &'static str,
-        /// Its beginning.
+        /// Beginning of the text.
         text: String,
         /// Longest identifier of this kind, bytes.
         max_len: usize,
@@ -24,9 +25,9 @@ pub enum IdError {
     /// A word that has another meaning in keys.
     #[error("{kind} {text:?} is a reserved word of the key space: one of {RESERVED_CAV_IDS:?}")]
     Reserved {
-        /// What the text was to name.
+        /// Kind of identifier.
         kind: &'static str,
-        /// The word.
+        /// The reserved word.
         text: String,
     },
 }
@@ -60,7 +61,7 @@ macro_rules! identifier {
             /// Checks `text`: 1 to [`Self::MAX_LEN`] characters of `a-z`, `0-9`, `_` and `-`.
             ///
             /// # Errors
-            /// [`IdError`] names the text that is no identifier.
+            /// [`IdError`] states the text that is no identifier.
             pub fn new(text: &str) -> Result<Self, IdError> {
                 check($kind, text, $max_len, $reserved).map(Self)
             }
@@ -111,7 +112,7 @@ identifier! {
     RunId, "run name", 32, &[]
 }
 identifier! {
-    /// One process of a run, for example `agent-4279`: who answers for a ledger.
+    /// One process of a run, for example `agent-4279`: the owner of a ledger.
     ProcessId, "process name", 64, &[]
 }
 
@@ -120,14 +121,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn accepts_the_names_of_datasets() {
+    fn accepts_ids_of_data_sets() {
         for text in ["4279", "-1", "cav_0", &"a".repeat(32)] {
             assert_eq!(CavId::new(text).unwrap().as_str(), text);
         }
     }
 
     #[test]
-    fn refuses_what_could_steer_a_key() {
+    fn refuses_text_that_could_alter_a_key() {
         for text in ["", "a/b", "*", "**", "@x", "a$*", "A", "é", &"a".repeat(33)] {
             assert!(CavId::new(text).is_err(), "{text}");
         }

@@ -1,4 +1,4 @@
-//! Every key of a run: built here, parsed here, nowhere else.
+//! Key grammar of a run: the only place that builds and parses keys.
 //!
 //! | key | from | to | message |
 //! | --- | --- | --- | --- |
@@ -8,12 +8,12 @@
 //! | `v2v/<run>/<ego>/detections[/json]` | ego-fuser | anyone | detections |
 //! | `v2v/<run>/truth` | replay | scorer | truth |
 //! | `v2v/<run>/control/<verb>` | operator, processes | replay, operator | control |
-//! | `v2v/<run>/ready/<process>` | every process | whoever holds the clock | control |
+//! | `v2v/<run>/ready/<process>` | every process | owner of the clock | control |
 //! | `v2v/<run>/stats/<process>` | every process | operator | stats |
 //! | `v2v/<run>/alive/<role>/<cav>` | every process | anyone | none: a liveliness token |
 //!
-//! A vehicle cannot be called `rx`, `truth`, `control`, `ready`, `stats` or `alive` ([`CavId`] refuses it), so each key has
-//! one reading. A [`Key`] never holds a wildcard; what subscribes to several keys is a [`KeyExpr`].
+//! A vehicle cannot be called `rx`, `truth`, `control`, `ready`, `stats` or `alive` ([`CavId`] rejects it), so the
+//! grammar is unambiguous. A [`Key`] never contains a wildcard; a subscription to several keys is a [`KeyExpr`].
 
 use std::fmt;
 use std::str::FromStr;
@@ -31,12 +31,12 @@ use crate::text::excerpt;
 
 /// First chunk of every key.
 pub const KEY_ROOT: &str = "v2v";
-/// What no process ever declares.
-pub(crate) const NOBODY: &str = "nobody";
-/// Longer texts are no keys, whatever they say.
+/// Chunk of a key that no process ever declares.
+pub(crate) const UNDECLARED: &str = "nobody";
+/// Maximum length of a key, bytes; longer texts are rejected.
 pub(crate) const MAX_KEY_BYTES: usize = 256;
 
-/// Why a text is not a key.
+/// Error of a text that is not a key.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum KeyError {
     /// No key of this program has that form.
@@ -56,7 +56,7 @@ pub enum KeyError {
     Id {
         /// The beginning of the key.
         text: String,
-        /// What is wrong with the chunk.
+        /// Error of the chunk.
         source: IdError,
     },
 }
@@ -67,7 +67,7 @@ impl KeyError {
     }
 }
 
-/// As much of a text as an error shows.
+/// The beginning of a text, as shown in errors.
 pub(crate) fn shown(text: &str) -> String {
     excerpt(text, MAX_KEY_BYTES)
 }
@@ -155,7 +155,8 @@ impl KeyExpr {
         Self(format!("{KEY_ROOT}/{runs}/{topics}"))
     }
 
-    /// Everything of some runs, in two expressions: the wildcard of the first passes over chunks that begin with `@`.
+    /// Everything of some runs, in two expressions: the wildcard of the first does not match chunks that begin with
+    /// `@`.
     #[must_use]
     pub fn all_of(runs: &RunScope) -> [Self; 2] {
         [Self::within(runs, &"**"), Self::within(runs, &format_args!("*/{}", Stream::Preview))]
@@ -167,10 +168,10 @@ impl KeyExpr {
         Self(format!("{KEY_ROOT}/{run}/**"))
     }
 
-    /// What no process ever declares: `v2v/<run>/nobody`. To ask there is to ask the network alone.
+    /// Key that no process ever declares: `v2v/<run>/nobody`. A query on it reaches the router only.
     #[must_use]
     pub fn none(run: &RunId) -> Self {
-        Self(format!("{KEY_ROOT}/{run}/{NOBODY}"))
+        Self(format!("{KEY_ROOT}/{run}/{UNDECLARED}"))
     }
 
     /// One stream of every vehicle, before the link.
@@ -203,7 +204,7 @@ impl KeyExpr {
         Self(format!("{KEY_ROOT}/{run}/control/*"))
     }
 
-    /// What every process says of the routes it has heard of.
+    /// Readiness of every process: the routes that it has confirmed.
     #[must_use]
     pub fn ready(run: &RunId) -> Self {
         Self(format!("{KEY_ROOT}/{run}/ready/*"))

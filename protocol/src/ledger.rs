@@ -1,19 +1,19 @@
-//! The books: nothing is lost without a line that says why.
+//! Message accounting: every published message is delivered or counted under a [`DropReason`].
 //!
-//! Every process counts what it sends, what it takes and what it drops. Added up over a run, for each topic and each
-//! process that receives it,
+//! A ledger holds the message counters of a process: sent, received, in flight, dropped. Summed over a run, for each
+//! topic and each receiving process,
 //!
 //! `sent = received + dropped(reason) + in flight`.
 //!
-//! - A sender counts what it publishes, and what it drops before publishing (a newer frame took the place), without
-//!   naming a receiver: such lines hold for every receiver of the topic.
-//! - A receiver opens an account when it subscribes ([`Ledger::open`]), so that it is known even if nothing ever comes;
-//!   it counts as received what it accepted and used, and everything else as dropped.
-//! - In virtual time the link counts under the *sender's* topic what it drops on the way to one receiver, what it still
-//!   holds (in flight), and a duplicate that it makes as sent once more, and is no receiver itself.
-//! - A live link is a process between two topics. It receives what agents publish: what it passes on is received, what
-//!   the air loses is dropped, what it still holds is in flight. And it publishes under `rx/...` what it passes on, a
-//!   duplicate once more.
+//! - A sender counts the messages that it publishes, and those that it drops before publishing (replaced by a newer
+//!   frame), without naming a receiver: such lines hold for every receiver of the topic.
+//! - A receiver opens an account when it subscribes ([`Ledger::open`]), so that it is known even if nothing ever
+//!   arrives; it counts accepted and used messages as received, and all others as dropped.
+//! - In simulation time the link counts, under the *sender's* topic, the messages that it drops on the way to one
+//!   receiver, those in flight, and a duplicate that it makes as sent once more. It is no receiver itself.
+//! - A live link is a process between two topics. It receives the messages of agents: messages that it forwards are
+//!   received, those lost on the emulated link are dropped, those it still holds are in flight. It publishes under
+//!   `rx/...` the messages that it forwards, a duplicate once more.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -27,7 +27,7 @@ use crate::Reconciliation;
 use crate::Topic;
 use crate::reconciliation::Discrepancy;
 
-/// What is counted separately: a topic, and who receives it (`None`: whoever does).
+/// Key of a set of counters: a topic and its receiver (`None`: any receiver).
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Account {
     /// The topic on which the message was first published.
@@ -37,13 +37,13 @@ pub struct Account {
 }
 
 impl Account {
-    /// What a sender counts.
+    /// Account of a sender.
     #[must_use]
     pub fn published(topic: Topic) -> Self {
         Self { topic, to: None }
     }
 
-    /// What a receiver, or the link on the way to it, counts.
+    /// Account of a receiver, or of the link on the way to it.
     #[must_use]
     pub fn towards(topic: Topic, to: &ProcessId) -> Self {
         Self { topic, to: Some(to.clone()) }
@@ -59,18 +59,18 @@ impl fmt::Display for Account {
     }
 }
 
-/// One account's counters.
+/// Counters of one account.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct Counts {
     /// Messages published.
     pub sent: u64,
     /// Messages accepted and used.
     pub received: u64,
-    /// Messages under way.
+    /// Messages in flight.
     pub in_flight: u64,
     /// Messages lost, by reason.
     pub dropped: BTreeMap<DropReason, u64>,
-    /// Maps that had to keep within a limit, by what was chosen for them. They are among those sent.
+    /// Feature maps that had to keep within a limit, by the reason for their format. They are among those sent.
     pub adapted: BTreeMap<RateReason, u64>,
 }
 
@@ -91,7 +91,7 @@ impl Counts {
         add_each(&mut self.adapted, adapted);
     }
 
-    /// Sent less everything that is accounted for; 0 where the books balance.
+    /// Sent minus all messages that are accounted for; 0 if the account is balanced.
     pub(crate) fn missing(&self) -> i128 {
         let accounted = [self.received, self.in_flight].into_iter().chain(self.dropped.values().copied());
         i128::from(self.sent) - accounted.map(i128::from).sum::<i128>()
@@ -105,14 +105,15 @@ fn add_each<K: Ord + Copy>(sums: &mut BTreeMap<K, u64>, counts: &BTreeMap<K, u64
     }
 }
 
-/// The books of one process, or of many added up.
+/// The message counters of one process, or the sum over many.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(from = "Vec<Line>", into = "Vec<Line>")]
 pub struct Ledger {
     accounts: BTreeMap<Account, Counts>,
 }
 
-/// One account as written: in JSON `{"topic": "4279/bev", "to": "ego-4279", "sent": 0, ..., "dropped": {"stale": 1}}`.
+/// One account as serialised: in JSON `{"topic": "4279/bev", "to": "ego-4279", "sent": 0, ..., "dropped": {"stale":
+/// 1}}`.
 #[derive(Clone, Serialize, Deserialize)]
 struct Line {
     topic: Topic,
@@ -146,48 +147,48 @@ impl From<Ledger> for Vec<Line> {
 }
 
 impl Ledger {
-    /// Opens an account with nothing on it.
+    /// Opens an account with all counters at zero.
     pub fn open(&mut self, account: &Account) {
         self.counts(account);
     }
 
-    /// One more message published.
+    /// Counts one message published.
     pub fn sent(&mut self, account: &Account) {
         let counts = self.counts(account);
         counts.sent = counts.sent.saturating_add(1);
     }
 
-    /// One more message used.
+    /// Counts one message used.
     pub fn received(&mut self, account: &Account) {
         let counts = self.counts(account);
         counts.received = counts.received.saturating_add(1);
     }
 
-    /// One more message lost.
+    /// Counts one message dropped.
     pub fn dropped(&mut self, account: &Account, reason: DropReason) {
         let count = self.counts(account).dropped.entry(reason).or_default();
         *count = count.saturating_add(1);
     }
 
-    /// One more map written so that it keeps within a limit.
+    /// Counts one feature map that was written to keep within a limit.
     pub fn adapted(&mut self, account: &Account, reason: RateReason) {
         let count = self.counts(account).adapted.entry(reason).or_default();
         *count = count.saturating_add(1);
     }
 
-    /// How many messages are under way right now.
+    /// Sets the number of messages in flight.
     pub fn set_in_flight(&mut self, account: &Account, messages: u64) {
         self.counts(account).in_flight = messages;
     }
 
-    /// Adds another process's books.
+    /// Adds the counters of another process.
     pub fn merge(&mut self, other: &Self) {
         for (account, counts) in &other.accounts {
             self.counts(account).add(counts);
         }
     }
 
-    /// The counters of an account; `None` where nothing was ever counted.
+    /// The counters of an account; `None` if nothing was ever counted.
     #[must_use]
     pub fn get(&self, account: &Account) -> Option<&Counts> {
         self.accounts.get(account)
@@ -204,13 +205,13 @@ impl Ledger {
         self.accounts.len()
     }
 
-    /// Whether nothing was ever counted.
+    /// True if nothing was ever counted.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.accounts.is_empty()
     }
 
-    /// All accounts added up. A topic with two receivers counts as sent once and received twice.
+    /// Sum of all accounts. A topic with two receivers counts as sent once and received twice.
     #[must_use]
     pub fn total(&self) -> Counts {
         let mut total = Counts::default();
@@ -218,26 +219,26 @@ impl Ledger {
         total
     }
 
-    /// Compares what was sent with what is accounted for, for each topic and receiver. Call it on the sum of all
-    /// processes' books.
+    /// Compares sent messages with those accounted for, for each topic and receiver. To be called on the sum of the
+    /// ledgers of all processes.
     #[must_use]
     pub fn balance(&self) -> Reconciliation {
         Reconciliation::of(self)
     }
 
-    /// MessageStats what nobody can account for on the accounts that `is_excused` names, because one of those concerned was away:
-    /// as dropped for that reason what vanished, as sent what came although its sender never told of it. Returns how many
-    /// messages that were. All other accounts have to add up by themselves.
-    pub fn exempt(&mut self, is_excused: impl Fn(&Account) -> bool) -> u64 {
+    /// Exempts the accounts that `is_exempt` selects, because a process concerned was offline: missing messages are
+    /// counted as dropped for that reason, surplus messages as sent. Returns the number of messages exempted. All other
+    /// accounts have to balance by themselves.
+    pub fn exempt(&mut self, is_exempt: impl Fn(&Account) -> bool) -> u64 {
         let mut exempted = 0;
         for Discrepancy { topic, to, missing, .. } in self.balance().differences {
             let account = Account { topic, to };
-            if !is_excused(&account) {
+            if !is_exempt(&account) {
                 continue;
             }
             let counts = self.counts(&account);
             match u64::try_from(missing) {
-                Ok(vanished) => *counts.dropped.entry(DropReason::PeerOffline).or_default() += vanished,
+                Ok(missing) => *counts.dropped.entry(DropReason::PeerOffline).or_default() += missing,
                 Err(_) => counts.sent = counts.sent.saturating_add(missing.unsigned_abs()),
             }
             exempted += missing.unsigned_abs();
@@ -266,8 +267,8 @@ mod tests {
         "4288/bev".parse().unwrap()
     }
 
-    /// An agent that sends 10, of which the link holds 1 and loses 2, repeats 1, and the ego uses 6 and drops 2.
-    fn books() -> [Ledger; 3] {
+    /// An agent sends 10 messages: the link holds 1, loses 2 and repeats 1; the ego uses 6 and drops 2.
+    fn ledgers() -> [Ledger; 3] {
         let [mut agent, mut link, mut ego] = [(); 3].map(|()| Ledger::default());
         let published = Account::published(bev());
         let towards = Account::towards(bev(), &process("ego-4279"));
@@ -288,42 +289,42 @@ mod tests {
         [agent, link, ego]
     }
 
-    fn sum(books: &[Ledger]) -> Ledger {
+    fn sum(ledgers: &[Ledger]) -> Ledger {
         let mut sum = Ledger::default();
-        books.iter().for_each(|ledger| sum.merge(ledger));
+        ledgers.iter().for_each(|ledger| sum.merge(ledger));
         sum
     }
 
     #[test]
-    fn books_that_add_up_balance_in_any_order() {
-        let mut books = books();
-        let forward = sum(&books);
-        books.reverse();
-        assert_eq!(sum(&books), forward);
+    fn ledgers_balance_in_any_order() {
+        let mut ledgers = ledgers();
+        let forward = sum(&ledgers);
+        ledgers.reverse();
+        assert_eq!(sum(&ledgers), forward);
         assert_eq!(forward.balance(), Reconciliation::default());
         let total = forward.total();
         assert_eq!((total.sent, total.received, total.in_flight, total.dropped_total()), (11, 6, 1, 4));
     }
 
     #[test]
-    fn a_vanished_message_is_named() {
-        let mut books = books();
-        books[0].sent(&Account::published(bev()));
-        let balance = sum(&books).balance();
+    fn a_missing_message_is_reported() {
+        let mut ledgers = ledgers();
+        ledgers[0].sent(&Account::published(bev()));
+        let balance = sum(&ledgers).balance();
         assert!(!balance.is_exact());
         assert_eq!(balance.differences[0].missing, 1);
         assert_eq!(
             balance.differences[0].to_string(),
-            "4288/bev to ego-4279: 1 vanished (sent 12, received 6, dropped 4, in flight 1)"
+            "4288/bev to ego-4279: 1 not accounted for (sent 12, received 6, dropped 4, in flight 1)"
         );
-        books[2].received(&Account::towards(bev(), &process("ego-4279")));
-        books[2].received(&Account::towards(bev(), &process("ego-4279")));
-        assert_eq!(sum(&books).balance().differences[0].missing, -1);
+        ledgers[2].received(&Account::towards(bev(), &process("ego-4279")));
+        ledgers[2].received(&Account::towards(bev(), &process("ego-4279")));
+        assert_eq!(sum(&ledgers).balance().differences[0].missing, -1);
     }
 
     #[test]
     fn every_receiver_must_account_for_every_message() {
-        let mut ledger = sum(&books());
+        let mut ledger = sum(&ledgers());
         let second = Account::towards(bev(), &process("ego-4288"));
         ledger.open(&second);
         let difference = ledger.balance().differences.remove(0);
@@ -331,7 +332,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_sender_drops_is_lost_to_every_receiver() {
+    fn a_message_dropped_by_its_sender_is_lost_to_every_receiver() {
         let mut ledger = Ledger::default();
         let published = Account::published(bev());
         let receivers = ["a", "b"].map(|name| Account::towards(bev(), &process(name)));
@@ -343,8 +344,8 @@ mod tests {
     }
 
     #[test]
-    fn who_was_away_is_excused_and_nobody_else() {
-        let mut ledger = sum(&books());
+    fn only_offline_processes_are_exempt() {
+        let mut ledger = sum(&ledgers());
         let (published, lost) = (Account::published(bev()), Account::towards(bev(), &process("ego-4279")));
         (0..3).for_each(|_| ledger.sent(&published));
         assert_eq!(ledger.exempt(|_| false), 0);
@@ -357,7 +358,7 @@ mod tests {
     }
 
     #[test]
-    fn what_nobody_hears_is_no_loss_but_is_told() {
+    fn a_topic_without_receiver_is_no_loss_but_is_reported() {
         let mut ledger = Ledger::default();
         ledger.sent(&Account::published(bev()));
         let balance = ledger.balance();
@@ -366,8 +367,8 @@ mod tests {
     }
 
     #[test]
-    fn json_is_readable_and_comes_back() {
-        let ledger = sum(&books());
+    fn json_round_trip() {
+        let ledger = sum(&ledgers());
         let json = serde_json::to_string(&ledger).unwrap();
         assert_eq!(
             json,

@@ -1,7 +1,7 @@
-//! What crosses the air between connected automated vehicles (CAVs), and in which convention.
+//! Messages between connected automated vehicles (CAVs): types, wire format and conventions.
 //!
-//! This crate holds plain data and the two doors between that data and bytes, [`wire::encode`] and [`wire::decode`]. It
-//! knows no network, no clock, no file and no tensor library.
+//! This crate holds plain data and the two conversions between that data and bytes, [`wire::encode`] and
+//! [`wire::decode`]. It depends on no network, clock, file or tensor library.
 //!
 //! ```
 //! use protocol::{
@@ -26,7 +26,7 @@
 //! let encoded = wire::encode(&stamp, message)?;
 //! assert!(encoded.body.len() <= 2_000);
 //!
-//! // The ego: the payload may lie in any number of pieces.
+//! // The ego: the payload may be in any number of pieces.
 //! let (header, bev) = wire::decode::<Bev>(encoded.pieces(), &Limits::DEFAULT)?;
 //! header.check_sender(&"4279".parse()?)?;
 //! bev.features.check_shape(&grid, 4, None)?;
@@ -49,31 +49,31 @@
 //! | [`Points`] | `points` | agent | ego-fusers (early fusion) |
 //! | [`Descriptor`] | `descriptor` | agent | ego-fusers |
 //! | [`Detections`] | `detections` | ego-fuser | scorer, anyone |
-//! | [`DetectionsReport`] | `detections/json` | ego-fuser | anyone who reads JSON |
+//! | [`DetectionsReport`] | `detections/json` | ego-fuser | any reader of JSON |
 //! | [`Truth`] | `truth` | replay | scorer |
 //! | [`Control`] | `control/*`, and probes on any key | operator, replay, every process | replay, every process |
 //! | [`Stats`] | `stats/<process>` | every process | operator |
 //!
-//! A message is a header ([`header`]: who, which, when, how large, two checksums), metadata, and a body of raw
-//! little-endian values ([`Body`]). Which keys there are says [`key`], how a feature map becomes a body [`codec`].
+//! A message is a header ([`header`]: sender, sequence, times, sizes, two checksums), metadata, and a body of raw
+//! little-endian values ([`Body`]). Keys are defined in [`key`], the encoding of feature maps in [`codec`].
 //!
-//! # What a receiver can rely on
+//! # Guarantees to a receiver
 //!
-//! Any bytes may come. Decoding never panics, takes no memory for sizes that are only claimed, and hands out nothing but
-//! what was sealed by its sender: sizes that agree with each other and with [`Limits`], values that are finite and
-//! bounded, poses that are poses. Whatever is refused has a [`WireError`] with both numbers and a [`DropReason`] under
-//! which the [`Ledger`] counts it. The checksums find accidents; who a peer is, the transport has to establish.
+//! Any bytes may arrive. Decoding never panics, allocates no memory for sizes that are only claimed, and returns only
+//! values that the sender has sealed: sizes that agree with each other and with [`Limits`], values that are finite and
+//! bounded, valid poses. Every rejected message has a [`WireError`] with both numbers and a [`DropReason`] under which
+//! the [`Ledger`] counts it. The checksums detect accidents; the transport has to authenticate the peer.
 //!
 //! # Conventions
 //!
-//! They hold everywhere behind the readers of `sim-replay`, where the conventions of the datasets end.
+//! They hold everywhere behind the readers of `sim-replay`, where the conventions of the data sets end.
 //!
 //! - Frames are right-handed: x forward, y left, z up. Lengths are metres, angles radians (degrees only where a name
-//!   says `_deg` or a number is printed), heading and yaw turn x towards y.
-//! - A transform is named target-from-source: `ego_from_cav` takes points of the CAV's LiDAR frame to the ego's.
+//!   ends in `_deg` or a number is printed), heading and yaw turn x towards y.
+//! - A transform is named target-from-source: `ego_from_cav` maps points of the CAV's LiDAR frame to the ego's.
 //!   `world_from_cav` is the pose of a CAV, always of its LiDAR.
 //! - A box is `(x, y, z, dx, dy, dz, heading)`: centre, full length, width and height.
-//! - BEV maps are `[C, H, W]`: the row grows with y, the column with x.
+//! - BEV feature maps are `[C, H, W]`: the row grows with y, the column with x.
 //! - Times are nanoseconds: capture times on the clock of the scene, everything else on the Unix clock.
 
 pub mod access;
@@ -113,15 +113,15 @@ pub use codec::{
 };
 pub use drop_reason::DropReason;
 pub use error::WireError;
-pub use header::{HEADER_LEN, Header, Kind, Stamp, WIRE_VERSION};
+pub use header::{HEADER_LEN, Header, Stamp, WIRE_VERSION};
 pub use id::{CavId, IdError, ProcessId, RunId};
 pub use key::{Key, KeyError, KeyExpr};
 pub use ledger::{Account, Counts, Ledger};
 pub use limits::Limits;
 pub use message::{
     AgentTruth, Bev, Boxes, Control, Descriptor, Detections, DetectionsReport, FusedNeighbour, Gnss, GnssSource,
-    HeardNeighbour, Lidar, Message, ModelHash, NoPoseReason, Payload, Points, PoseEstimate, Radar, SkippedNeighbour,
-    StageSummary, StageTiming, Stats, TopicCount, TrueObject, Truth,
+    HeardNeighbour, Kind, Lidar, Message, ModelHash, NoPoseReason, Payload, Points, PoseEstimate, Radar,
+    SkippedNeighbour, StageSummary, StageTiming, Stats, TopicCount, TrueObject, Truth,
 };
 pub use misbehaviour_reason::MisbehaviourReason;
 pub use point_cloud::{Handedness, PointCloud};

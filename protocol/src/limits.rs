@@ -1,8 +1,8 @@
-//! How much of anything a receiver takes from a peer.
+//! Limits of a receiver on messages of a peer.
 
-/// Upper bounds, all checked before the memory they speak of is allocated.
+/// Upper bounds, all checked before memory is allocated.
 ///
-/// One set holds for every kind of message, so that the memory a peer can make a receiver hold at once is
+/// One set holds for every kind of message, so that the memory that a peer can make a receiver hold at once is
 /// `max_metadata_bytes + 2 * max_body_bytes` and a few kilobytes.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Limits {
@@ -25,10 +25,10 @@ pub struct Limits {
 }
 
 impl Limits {
-    /// The limit that the metadata decoder itself holds, whatever the configuration says: 1 MiB.
+    /// Limit of the metadata decoder itself, independent of the configuration: 1 MiB.
     pub const HARD_METADATA_BYTES: u32 = 1 << 20;
 
-    /// What a receiver takes when nothing else is configured: maps of 64 MiB, clouds of a million points.
+    /// Limits of a receiver by default: feature maps of 64 MiB, point clouds of a million points.
     pub const DEFAULT: Self = Self {
         max_metadata_bytes: Self::HARD_METADATA_BYTES,
         max_body_bytes: 64 << 20,
@@ -40,7 +40,7 @@ impl Limits {
         max_abs_value: 1e6,
     };
 
-    /// What a sender holds itself to: values are checked, sizes are the receiver's business.
+    /// Limits of a sender: values are checked, sizes are limited by the receiver.
     pub(crate) const SENDER: Self = Self {
         max_body_bytes: u64::MAX,
         max_points: u64::MAX,

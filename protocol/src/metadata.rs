@@ -1,7 +1,7 @@
-//! The small structured part of a message as bytes.
+//! Binary encoding of metadata, the small structured part of a message.
 //!
-//! The only file that knows how: bincode 2.0.1, little-endian, variable-length integers, a hard limit on what a decoder
-//! reads. bincode has no maintainer any more, so this door stays as narrow as two functions.
+//! The only file that depends on the format: bincode 2.0.1, little-endian, variable-length integers, a hard limit of
+//! bytes read by a decoder. bincode is no longer maintained, so this interface is limited to two functions.
 
 use bincode::config::{Configuration, Limit, LittleEndian, Varint};
 use serde::Serialize;
@@ -19,7 +19,8 @@ const CONFIG: Configuration<LittleEndian, Varint, Limit<HARD_LIMIT>> = bincode::
 /// Appends `metadata` to `head`.
 ///
 /// # Errors
-/// [`WireError::Metadata`] when a value cannot be written, [`WireError::Limit`] when it is larger than any receiver takes.
+/// [`WireError::Metadata`] when a value cannot be written, [`WireError::Limit`] when it exceeds the limit of every
+/// receiver.
 pub(crate) fn append<T: Serialize>(kind: Kind, metadata: &T, head: &mut Vec<u8>) -> Result<u32, WireError> {
     let len = bincode::serde::encode_into_std_write(metadata, head, CONFIG)
         .map_err(|error| WireError::Metadata { kind, detail: error.to_string() })?;
@@ -29,10 +30,10 @@ pub(crate) fn append<T: Serialize>(kind: Kind, metadata: &T, head: &mut Vec<u8>)
     Ok(len as u32)
 }
 
-/// Reads metadata that fill `bytes` to the last one.
+/// Reads metadata that fill `bytes` completely.
 ///
-/// A list's claimed length reserves at most 1 MiB before its elements are read, so memory follows the bytes that are
-/// there rather than those that are claimed.
+/// The claimed length of a list reserves at most 1 MiB before its elements are read, so memory follows the bytes that
+/// are there rather than those that are claimed.
 ///
 /// # Errors
 /// [`WireError::Metadata`] when they do not decode or leave bytes over.
@@ -59,7 +60,7 @@ mod tests {
     }
 
     #[test]
-    fn bytes_are_what_they_always_were() {
+    fn bytes_are_stable() {
         let (bytes, back) = round_trip(&(7u32, 1.5f64, Some("ab".to_owned()), vec![300u64]));
         assert_eq!(bytes, [7, 0, 0, 0, 0, 0, 0, 0xf8, 0x3f, 1, 2, b'a', b'b', 1, 251, 44, 1]);
         assert_eq!(back, (7, 1.5, Some("ab".to_owned()), vec![300]));

@@ -1,21 +1,21 @@
-//! Why a vehicle is not believed.
+//! Misbehaviour reasons: causes for which a vehicle is excluded.
 
 use crate::string_enum::named;
 
 named! {
-    /// What speaks against the words of a neighbour.
+    /// Evidence against a neighbour.
     pub enum MisbehaviourReason {
-        /// It is not where it says to be, or sees nothing of what is there.
+        /// Its reported position is wrong, or it detects nothing of the objects around it.
         PositionMismatch = "position_mismatch",
-        /// It sees vehicles where there are none.
+        /// It reports vehicles that do not exist.
         GhostObjects = "ghost_objects",
-        /// It says what somebody else has said.
+        /// Its message copies that of another vehicle.
         Duplicated = "duplicated",
-        /// What it says has nothing to do with what it said just before.
+        /// Its message contradicts its previous one.
         Inconsistent = "inconsistent",
-        /// It stands where it cannot have driven to.
+        /// It reports a position that it cannot have reached.
         ImplausibleMotion = "implausible_motion",
-        /// Nothing speaks against it, but nothing for it either.
+        /// There is no evidence against it, but none for it yet.
         Probation = "probation",
     }
 }

@@ -1,8 +1,8 @@
-//! One LiDAR sweep.
+//! Point cloud of one LiDAR sweep.
 
 use serde::{Deserialize, Serialize};
 
-/// Which way the axes of a recording turned before its reader made them right-handed.
+/// Handedness of a recording before its reader converts it to right-handed axes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Handedness {
@@ -28,13 +28,13 @@ impl PointCloud {
         self.xyzi.len()
     }
 
-    /// Whether the sweep has no point at all.
+    /// True if the sweep has no point.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.xyzi.is_empty()
     }
 
-    /// Every so manieth point, so that there are at most `most`.
+    /// Every n-th point, with n such that at most `most` points remain.
     #[must_use]
     pub fn decimate(&self, most: usize) -> Self {
         let step = self.len().div_ceil(most.max(1)).max(1);

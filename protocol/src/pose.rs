@@ -1,20 +1,20 @@
-//! Where a CAV is: SE(3) as translation and unit quaternion.
+//! Pose of a CAV: SE(3) as translation and unit quaternion.
 
 use nalgebra::{Isometry3, Matrix3, Matrix4, Quaternion, Rotation3, Translation3, UnitQuaternion};
 use serde::{Deserialize, Serialize};
 
-/// Positions farther from the origin than this are refused as outside data, metres.
+/// Largest absolute coordinate that is accepted from outside, metres.
 const MAX_ABS_M: f64 = 1e7;
-/// How far a quaternion's norm, or a matrix from orthonormality, may be off.
+/// Tolerance of a quaternion's norm, and of a matrix's orthonormality.
 const UNIT_TOLERANCE: f64 = 1e-4;
 
-/// Why numbers from outside are not a pose.
+/// Error of numbers from outside that are not a pose.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum PoseError {
-    /// A component is NaN, infinite or absurdly large.
+    /// A component is NaN, infinite or too large.
     #[error("pose component {0} is not a finite number within {MAX_ABS_M:e}")]
     NotFinite(f64),
-    /// The quaternion is not of length one.
+    /// The quaternion does not have length one.
     #[error("pose quaternion has length {0}, not 1")]
     NotUnit(f64),
     /// The rotation part of a matrix is not orthonormal or mirrors.
@@ -34,7 +34,7 @@ pub enum PoseError {
 
 /// A rigid transform, target-from-source: metres and a unit quaternion.
 ///
-/// Owned here rather than taken from `nalgebra`, so that another crate's layout never defines our bytes.
+/// Defined here rather than taken from `nalgebra`, so that the layout of another crate never defines the wire format.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Pose {
     /// Translation x, y, z in metres.
@@ -44,7 +44,7 @@ pub struct Pose {
 }
 
 impl Pose {
-    /// The transform that changes nothing.
+    /// The identity transform.
     pub const IDENTITY: Self = Self { translation_m: [0.0; 3], rotation_wxyz: [1.0, 0.0, 0.0, 0.0] };
 
     /// A planar pose: position, height and heading.
@@ -78,7 +78,7 @@ impl Pose {
         Ok(Isometry3::from_parts(translation, rotation).into())
     }
 
-    /// Checks a pose that came from outside.
+    /// Checks a pose from outside.
     ///
     /// # Errors
     /// [`PoseError`] when a number is not finite, beyond 10,000 km, or the quaternion is not of length one.
@@ -97,7 +97,7 @@ impl Pose {
         (2.0 * (w * z + x * y)).atan2(1.0 - 2.0 * (y * y + z * z))
     }
 
-    /// The transform as `nalgebra` computes with it.
+    /// The transform as a `nalgebra` type.
     #[must_use]
     pub fn isometry(&self) -> Isometry3<f64> {
         let [w, x, y, z] = self.rotation_wxyz;

@@ -1,4 +1,4 @@
-//! Whether the books of a run add up.
+//! Reconciliation of senders' and receivers' counters at the end of a run.
 
 use std::collections::BTreeSet;
 use std::fmt;
@@ -11,25 +11,26 @@ use crate::Ledger;
 use crate::ProcessId;
 use crate::Topic;
 
-/// What [`Ledger::balance`] finds.
+/// Result of [`Ledger::balance`].
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct Reconciliation {
-    /// Accounts whose numbers do not add up.
+    /// Accounts that do not balance.
     pub differences: Vec<Discrepancy>,
-    /// Topics that nobody subscribed to: sent, lost to no one.
+    /// Topics without any receiver; their messages are not lost.
     pub unheard: Vec<UnreceivedTopic>,
 }
 
-/// One account that does not add up.
+/// One account that does not balance.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Discrepancy {
     /// The topic.
     pub topic: Topic,
-    /// The receiving process, where one is known.
+    /// The receiving process, if one is known.
     pub to: Option<ProcessId>,
-    /// Sent less received, dropped and in flight: positive, messages vanished; negative, messages came from nowhere.
+    /// Sent minus received, dropped and in flight: positive, messages are missing; negative, there are surplus
+    /// messages.
     pub missing: i64,
-    /// The numbers that do not add up.
+    /// The counters that do not balance.
     pub counts: Counts,
 }
 
@@ -43,7 +44,7 @@ pub struct UnreceivedTopic {
 }
 
 impl Reconciliation {
-    /// Whether every message is accounted for.
+    /// True if every message is accounted for.
     #[must_use]
     pub fn is_exact(&self) -> bool {
         self.differences.is_empty()
@@ -51,17 +52,17 @@ impl Reconciliation {
 
     pub(crate) fn of(ledger: &Ledger) -> Self {
         let mut balance = Self::default();
-        let heard: BTreeSet<&Topic> =
+        let received: BTreeSet<&Topic> =
             ledger.iter().filter_map(|(account, _)| account.to.as_ref().map(|_| &account.topic)).collect();
         for (account, counts) in ledger.iter() {
             let mut counts = counts.clone();
             if account.to.is_some() {
-                // What is counted without a receiver holds for each.
+                // Counts without a receiver hold for each receiver.
                 if let Some(published) = ledger.get(&Account::published(account.topic.clone())) {
                     counts.add(published);
                 }
                 balance.push_difference(account, counts);
-            } else if !heard.contains(&account.topic) {
+            } else if !received.contains(&account.topic) {
                 match u64::try_from(counts.missing()) {
                     Ok(0) => {}
                     Ok(messages) => balance.unheard.push(UnreceivedTopic { topic: account.topic.clone(), messages }),
@@ -76,7 +77,7 @@ impl Reconciliation {
         let missing = counts.missing();
         if missing != 0 {
             let Account { topic, to } = account.clone();
-            // MessageStats of real runs are far from the ends of the range; hostile ones may be cut there.
+            // Counters of real runs are far from the ends of the range; hostile ones may be clamped.
             let missing = missing.clamp(i64::MIN.into(), i64::MAX.into()) as i64;
             self.differences.push(Discrepancy { topic, to, missing, counts });
         }
@@ -87,7 +88,8 @@ impl fmt::Display for Discrepancy {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { topic, to, missing, counts } = self;
         let to = to.as_ref().map(|to| format!(" to {to}")).unwrap_or_default();
-        let (verb, count) = if *missing > 0 { ("vanished", *missing) } else { ("came from nowhere", -missing) };
+        let (verb, count) =
+            if *missing > 0 { ("not accounted for", *missing) } else { ("received but never sent", -missing) };
         write!(
             f,
             "{topic}{to}: {count} {verb} (sent {}, received {}, dropped {}, in flight {})",

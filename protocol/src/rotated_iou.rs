@@ -1,4 +1,4 @@
-//! Overlap of boxes seen from above, exact: convex polygons are clipped by each other.
+//! Exact overlap of boxes seen from above, by clipping of convex polygons.
 
 /// Corners of a footprint, metres, in order around it.
 pub type Footprint = [[f64; 2]; 4];
@@ -6,7 +6,7 @@ pub type Footprint = [[f64; 2]; 4];
 /// A quadrilateral clipped by four half planes has at most eight corners; each clip adds one.
 const MAX_CORNERS: usize = 8;
 
-/// A footprint with what every comparison needs: bounds and area.
+/// A footprint with precomputed bounds and area.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Polygon {
     /// Corners, counter-clockwise.
@@ -37,14 +37,14 @@ impl Polygon {
         self.area
     }
 
-    /// Area of overlap of the axis-aligned bounds: never less than that of the polygons.
+    /// Area of overlap of the axis-aligned bounds, square metres: never less than that of the polygons.
     #[must_use]
     pub fn bounds_overlap(&self, other: &Self) -> f64 {
         let side = |axis: usize| self.high[axis].min(other.high[axis]) - self.low[axis].max(other.low[axis]);
         side(0).max(0.0) * side(1).max(0.0)
     }
 
-    /// Area that both cover, square metres.
+    /// Area of the intersection, square metres.
     #[must_use]
     pub fn intersection(&self, other: &Self) -> f64 {
         if self.bounds_overlap(other) <= 0.0 {
@@ -60,7 +60,7 @@ impl Polygon {
         signed_area(&clipped.corners[..clipped.len]).clamp(0.0, self.area.min(other.area))
     }
 
-    /// Intersection over union, 0..1; 0 when neither has an area.
+    /// Intersection over union, 0..1; 0 if neither has an area.
     #[must_use]
     pub fn iou(&self, other: &Self) -> f64 {
         let intersection = self.intersection(other);
@@ -68,11 +68,11 @@ impl Polygon {
         if union > 0.0 { intersection / union } else { 0.0 }
     }
 
-    /// Whether the IoU is above `threshold`; answers without clipping where bounds and areas already tell.
+    /// True if the IoU is above `threshold`; decided without clipping if bounds and areas suffice.
     #[must_use]
     pub fn overlaps_more_than(&self, other: &Self, threshold: f64) -> bool {
         let most = self.bounds_overlap(other).min(self.area).min(other.area);
-        // IoU rises with the intersection, so what the bound cannot reach the polygons cannot either.
+        // IoU rises with the intersection, so the polygons cannot exceed the bound.
         if most <= threshold * (self.area + other.area - most) {
             return false;
         }
@@ -81,7 +81,7 @@ impl Polygon {
     }
 }
 
-/// A polygon in the course of clipping.
+/// A polygon during clipping.
 #[derive(Clone, Copy)]
 struct Clipped {
     corners: [[f64; 2]; MAX_CORNERS],
@@ -99,8 +99,8 @@ impl From<&Footprint> for Clipped {
 impl Clipped {
     /// The part to the left of the line from `a` to `b` (Sutherland and Hodgman's step).
     ///
-    /// A cut lies on the segment between its two corners whatever the rounding, so touching and coinciding edges
-    /// cannot throw a corner far away.
+    /// A cut is on the segment between its two corners whatever the rounding, so touching and coinciding edges cannot
+    /// move a corner far away.
     fn keep_left_of(&self, a: [f64; 2], b: [f64; 2]) -> Self {
         let side = |p: [f64; 2]| (b[0] - a[0]) * (p[1] - a[1]) - (b[1] - a[1]) * (p[0] - a[0]);
         let mut kept = Self { corners: [[0.0; 2]; MAX_CORNERS], len: 0 };
@@ -120,7 +120,7 @@ impl Clipped {
         kept
     }
 
-    /// Rounding on nearly coinciding edges can ask for a ninth corner; it lies within rounding of another one.
+    /// Rounding on nearly coinciding edges can produce a ninth corner; it is within rounding of another one.
     fn push(&mut self, corner: [f64; 2]) {
         if self.len < MAX_CORNERS {
             self.corners[self.len] = corner;
@@ -129,8 +129,8 @@ impl Clipped {
     }
 }
 
-/// Area of a polygon, positive when counter-clockwise. Coordinates are taken relative to the first corner: far from
-/// the origin the products would otherwise lose the digits that matter.
+/// Area of a polygon, positive if counter-clockwise. Coordinates are taken relative to the first corner: far from the
+/// origin the products would lose their significant digits.
 fn signed_area(corners: &[[f64; 2]]) -> f64 {
     let [x0, y0] = corners[0];
     let mut doubled = 0.0;
@@ -162,7 +162,7 @@ mod tests {
         assert!((car.iou(&polygon(100.0, -30.0, 4.0, 2.0, 0.3 + PI)) - 1.0).abs() < 1e-9);
         let half = polygon(0.0, 0.0, 4.0, 2.0, 0.0).iou(&polygon(2.0, 0.0, 4.0, 2.0, 0.0));
         assert!((half - 4.0 / 12.0).abs() < 1e-12);
-        // A square and the same turned by 45 degrees meet in a regular octagon.
+        // A square and the same square rotated by 45 degrees intersect in a regular octagon.
         let octagon = polygon(0.0, 0.0, 2.0, 2.0, 0.0).intersection(&polygon(0.0, 0.0, 2.0, 2.0, FRAC_PI_4));
         assert!((octagon - 8.0 * (2.0_f64.sqrt() - 1.0)).abs() < 1e-12);
     }

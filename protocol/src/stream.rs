@@ -1,4 +1,4 @@
-//! What one vehicle publishes: the last chunks of its keys.
+//! Streams of one vehicle: the last chunks of its keys.
 
 use std::fmt;
 use std::str::FromStr;
@@ -16,8 +16,8 @@ use crate::string_enum::written_as_text;
 pub enum Stream {
     /// `lidar`: sweeps.
     Lidar,
-    /// `@preview`: a few points of every sweep, for people who look on. The `@` keeps it from whoever listens to everything: a
-    /// recording has whole sweeps.
+    /// `@preview`: a few points of every sweep, for viewers. A subscription to all keys does not match a chunk that
+    /// begins with `@`: a recording has whole sweeps.
     Preview,
     /// `gnss`: recorded or GNSS poses.
     Gnss,
@@ -29,20 +29,20 @@ pub enum Stream {
     Pose,
     /// `bev`: feature maps.
     Bev,
-    /// `boxes`: detections of one vehicle alone.
+    /// `boxes`: detections of one vehicle from its own sensors.
     Boxes,
     /// `points`: raw points, for the early-fusion baseline only.
     Points,
-    /// `descriptor`: what the vehicle is going to send.
+    /// `descriptor`: model and streams of the vehicle.
     Descriptor,
-    /// `detections`: what an ego detected.
+    /// `detections`: detections of an ego.
     Detections,
     /// `detections/json`: the same as JSON.
     DetectionsJson,
 }
 
 impl Stream {
-    /// The kind of the messages on this stream; `None` where they are not of this wire format.
+    /// The kind of the messages on this stream; `None` if they do not have this wire format.
     #[must_use]
     pub fn kind(self) -> Option<Kind> {
         Some(match self {
@@ -59,8 +59,8 @@ impl Stream {
         })
     }
 
-    /// More than a message of this stream ever has, bytes; `None`: as much as the transport takes. For whoever passes
-    /// messages on without reading them.
+    /// Limit of the size of a message of this stream, bytes; `None`: limited by the transport only. For processes that
+    /// forward messages without reading them.
     #[must_use]
     pub fn most_bytes(self) -> Option<usize> {
         match self {

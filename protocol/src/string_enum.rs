@@ -1,7 +1,7 @@
-//! Values that are their own spelling: in keys, in text formats and in reports.
+//! Enums that are written as text: in keys, in text formats and in reports.
 
-/// An enum whose values have one name each, which is how they stand in keys and in JSON. On the wire a value is its
-/// place in the list, so a new one goes to the end.
+/// An enum whose values have one name each, used in keys and in JSON. On the wire a value is its index in the list, so
+/// a new one is appended at the end.
 macro_rules! named {
     ($(#[$doc:meta])* pub enum $name:ident { $($(#[$value_doc:meta])* $value:ident = $text:literal,)+ }) => {
         $(#[$doc])*
@@ -33,7 +33,7 @@ macro_rules! named {
     };
 }
 
-/// Conversions from and to an owned text, by way of `FromStr` and `Display`, as serde wants them for a type that is
+/// Conversions from and to an owned text, by way of `FromStr` and `Display`, as serde requires them for a type that is
 /// written as text.
 macro_rules! written_as_text {
     ($name:ident) => {

@@ -1,4 +1,4 @@
-//! Text forms that several crates need: bytes as hexadecimal, and the beginning of a foreign text.
+//! Text forms that several crates need: bytes as hexadecimal, and excerpts of foreign texts.
 
 use std::fmt::Write as _;
 

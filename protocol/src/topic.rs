@@ -1,4 +1,4 @@
-//! What a key is about, below its run.
+//! Topics: the part of a key below its run.
 
 use std::fmt;
 use std::str::FromStr;
@@ -16,7 +16,7 @@ use crate::key::{MAX_KEY_BYTES, shown};
 use crate::string_enum::{named, written_as_text};
 
 named! {
-    /// What a process does in a run: the part of a liveliness token that says whom one can expect what from.
+    /// Role of a process in a run, part of its liveliness token.
     pub enum Role {
         /// Publishes one vehicle's poses and features.
         Agent = "agent",
@@ -24,11 +24,11 @@ named! {
         Ego = "ego",
         /// Streams a scene.
         Replay = "replay",
-        /// Emulates the air.
+        /// Emulates the V2V link.
         Link = "link",
-        /// Compares detections with the truth.
+        /// Compares detections with the ground truth.
         Scorer = "scorer",
-        /// Writes down everything that is said.
+        /// Records all messages.
         Recorder = "recorder",
         /// Shows the run to people.
         Viewer = "viewer",
@@ -36,15 +36,15 @@ named! {
 }
 
 named! {
-    /// What a control message asks for or says: one key each, so that a process hears only what concerns it.
+    /// Verb of a control message: one key each, so that a process receives only messages that concern it.
     pub enum Verb {
         /// Start the scene's clock.
         Start = "start",
-        /// Halt it.
+        /// Halt the clock.
         Pause = "pause",
-        /// Let it run on.
+        /// Start the clock again after a halt.
         Resume = "resume",
-        /// Move on by some ticks and halt.
+        /// Advance by a number of ticks and halt.
         Step = "step",
         /// Go to a tick.
         Seek = "seek",
@@ -59,35 +59,35 @@ named! {
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub enum Topic {
-    /// `<cav>/<stream>`: what a vehicle, or the replay on its behalf, publishes.
+    /// `<cav>/<stream>`: a stream of a vehicle, published by it or by the replay on its behalf.
     Stream {
         /// The vehicle.
         cav: CavId,
-        /// What of it.
+        /// Stream of the vehicle.
         stream: Stream,
     },
-    /// `rx/<ego>/<cav>/<stream>`: the same as it reaches an ego over the emulated air.
+    /// `rx/<ego>/<cav>/<stream>`: the same as it reaches an ego over the emulated link.
     Received {
-        /// Who receives.
+        /// Receiving vehicle.
         ego: CavId,
-        /// Who sent.
+        /// Sending vehicle.
         cav: CavId,
-        /// What of it.
+        /// Stream of the sending vehicle.
         stream: Stream,
     },
     /// `truth`.
     Truth,
     /// `control/<verb>`.
     Control(Verb),
-    /// `ready/<process>`: which routes it has heard of.
+    /// `ready/<process>`: routes that the process has confirmed.
     Ready(ProcessId),
     /// `stats/<process>`.
     Stats(ProcessId),
     /// `alive/<role>/<cav>`: a liveliness token.
     Alive {
-        /// What the process does.
+        /// Role of the process.
         role: Role,
-        /// For which vehicle; a process without one uses a name of its own.
+        /// Vehicle of the process; a process without one uses a name of its own.
         cav: CavId,
     },
 }
@@ -99,8 +99,8 @@ impl Topic {
         Key { run: run.clone(), topic: self }
     }
 
-    /// Whether the ledger covers it: data, but neither the talk about the run itself nor what is said again and again
-    /// for those who come later, of whom nobody knows how much of it they should have heard, nor what is only looked at.
+    /// True if the ledger covers it: data, but not control messages, not messages that are repeated for late joiners
+    /// (their number of receptions is undefined), and not previews.
     #[must_use]
     pub fn is_booked(&self) -> bool {
         match self {

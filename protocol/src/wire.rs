@@ -1,7 +1,7 @@
-//! The two doors between messages and bytes.
+//! Encoding and decoding of messages.
 //!
-//! Encoding gives head and body apart: append the body to a network payload as it is, for example through
-//! `bytes::Bytes::from_owner(encoded.body)`, and nothing large is ever copied. Decoding reads from as many pieces as the
+//! Encoding returns head and body separately: append the body to a network payload as it is, for example through
+//! `bytes::Bytes::from_owner(encoded.body)`, and nothing large is copied. Decoding reads from as many pieces as the
 //! network delivers and copies a tensor once, into aligned memory, checking checksum and values on the way.
 
 use crc32fast::Hasher;
@@ -10,24 +10,21 @@ use crate::Body;
 use crate::Limits;
 use crate::WireError;
 use crate::body::{PayloadReader, check_body};
-use crate::header::{HEADER_LEN, Header, Kind, Stamp};
-use crate::message::{
-    Bev, Boxes, Control, Descriptor, Detections, Gnss, Lidar, Message, Payload, Points, PoseEstimate, Radar, Stats,
-    Truth, for_message,
-};
+use crate::header::{HEADER_LEN, Header, Stamp};
+use crate::message::{Message, MessageSource, MessageVisitor, Payload};
 use crate::metadata;
 
-/// A message as it goes on the wire: `head`, then `body`, nothing between or after.
+/// A message as it is transmitted: `head`, then `body`, nothing between or after.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Encoded {
     /// Header and metadata.
     pub head: Vec<u8>,
-    /// The body, in the memory the message had it in.
+    /// The body, in its original memory.
     pub body: Body,
 }
 
 impl Encoded {
-    /// Bytes on the wire, without what the transport adds.
+    /// Bytes on the wire, without the overhead of the transport.
     #[must_use]
     pub fn wire_bytes(&self) -> usize {
         self.head.len() + self.body.len()
@@ -46,14 +43,14 @@ impl Encoded {
     }
 }
 
-/// Encodes a message, taking its tensor along without a copy.
+/// Encodes a message, moving its tensor without a copy.
 ///
-/// The numbers of a body are not looked at: every receiver does so anyway, and a pass over a map costs as much again as
-/// its checksum. An agent that sends a NaN finds it in the ledger as `not_finite`.
+/// The numbers of a body are not checked: every receiver checks them, and a pass over a feature map costs as much again
+/// as its checksum. A NaN sent by an agent appears in the ledger as `not_finite`.
 ///
 /// # Errors
-/// [`WireError`] when the metadata hold what no receiver takes: a value out of bounds, a pose that is none, more than
-/// [`Limits::HARD_METADATA_BYTES`].
+/// [`WireError`] when the metadata exceed the limits of every receiver: a value out of bounds, an invalid pose, more
+/// than [`Limits::HARD_METADATA_BYTES`].
 pub fn encode<M: Payload>(stamp: &Stamp, message: M) -> Result<Encoded, WireError> {
     let (metadata, body) = message.into_parts();
     let shape = M::check(&metadata, &Limits::SENDER)?;
@@ -74,16 +71,27 @@ pub fn encode<M: Payload>(stamp: &Stamp, message: M) -> Result<Encoded, WireErro
     Ok(Encoded { head, body })
 }
 
-/// [`encode`] for a message of whatever kind.
+/// [`encode`] for a message of any kind.
 ///
 /// # Errors
 /// As [`encode`].
 pub fn encode_any(stamp: &Stamp, message: Message) -> Result<Encoded, WireError> {
-    for_message!(message, message => encode(stamp, message))
+    message.visit(Encoder(stamp))
 }
 
-/// Reads the header alone: who, what, when, how large. Touches the first 92 bytes only, so that it may be called where
-/// the network must not wait; whether the payload is sound, only [`decode`] tells.
+/// Encoding of a message of any kind.
+struct Encoder<'a>(&'a Stamp);
+
+impl MessageVisitor for Encoder<'_> {
+    type Output = Result<Encoded, WireError>;
+
+    fn visit<M: Payload>(self, message: M) -> Self::Output {
+        encode(self.0, message)
+    }
+}
+
+/// Reads the header only: sender, kind, times, sizes. Touches the first 92 bytes only, so that it may be called where
+/// the network must not wait; the payload is checked by [`decode`] only.
 ///
 /// # Errors
 /// [`WireError`] when there is no header of this version.
@@ -101,11 +109,11 @@ pub fn decode_header<'a>(pieces: impl IntoIterator<Item = &'a [u8]>) -> Result<H
     Err(WireError::Truncated { expected: HEADER_LEN as u64, found: filled as u64 })
 }
 
-/// Decodes a message of a known kind from the pieces it lies in.
+/// Decodes a message of a known kind from its pieces.
 ///
 /// # Errors
-/// [`WireError`] for anything but a sound message of that kind within `limits`; [`WireError::drop_reason`] says how to
-/// count it. No memory is taken for sizes that are only claimed.
+/// [`WireError`] for anything but a valid message of that kind within `limits`; [`WireError::drop_reason`] gives the
+/// reason under which it is counted. No memory is allocated for sizes that are only claimed.
 pub fn decode<'a, M: Payload>(
     pieces: impl IntoIterator<Item = &'a [u8]>,
     limits: &Limits,
@@ -118,7 +126,7 @@ pub fn decode<'a, M: Payload>(
     Ok((header, message))
 }
 
-/// Decodes a message of whatever kind.
+/// Decodes a message of any kind.
 ///
 /// # Errors
 /// As [`decode`].
@@ -126,25 +134,22 @@ pub fn decode_any<'a>(
     pieces: impl IntoIterator<Item = &'a [u8]>,
     limits: &Limits,
 ) -> Result<(Header, Message), WireError> {
-    fn read<M: Payload>(header: &Header, reader: PayloadReader<'_>, limits: &Limits) -> Result<M, WireError> {
-        decode_payload(header, reader, limits)
-    }
     let (header, reader) = open(pieces, limits)?;
-    let message = match header.kind {
-        Kind::Lidar => Message::Lidar(read::<Lidar>(&header, reader, limits)?),
-        Kind::Radar => Message::Radar(read::<Radar>(&header, reader, limits)?),
-        Kind::Gnss => Message::Gnss(read::<Gnss>(&header, reader, limits)?),
-        Kind::Pose => Message::Pose(read::<PoseEstimate>(&header, reader, limits)?),
-        Kind::Bev => Message::Bev(read::<Bev>(&header, reader, limits)?),
-        Kind::Boxes => Message::Boxes(read::<Boxes>(&header, reader, limits)?),
-        Kind::Points => Message::Points(read::<Points>(&header, reader, limits)?),
-        Kind::Descriptor => Message::Descriptor(read::<Descriptor>(&header, reader, limits)?),
-        Kind::Detections => Message::Detections(read::<Detections>(&header, reader, limits)?),
-        Kind::Truth => Message::Truth(read::<Truth>(&header, reader, limits)?),
-        Kind::Control => Message::Control(read::<Control>(&header, reader, limits)?),
-        Kind::Stats => Message::Stats(read::<Stats>(&header, reader, limits)?),
-    };
+    let message = Message::read(header.kind, Opened { header: &header, reader, limits })?;
     Ok((header, message))
+}
+
+/// Payload behind a header that has been checked.
+struct Opened<'a, 'b> {
+    header: &'a Header,
+    reader: PayloadReader<'b>,
+    limits: &'a Limits,
+}
+
+impl MessageSource for Opened<'_, '_> {
+    fn read<M: Payload>(self) -> Result<M, WireError> {
+        decode_payload(self.header, self.reader, self.limits)
+    }
 }
 
 /// Reads the header and compares all lengths with each other and with the limits.
@@ -173,15 +178,15 @@ fn open<'a>(
 
 /// Reads the payload; `reader` holds exactly as many bytes as the header announces.
 ///
-/// The checksum speaks first: whatever else is wrong with a message that was changed on the way is no news.
+/// The checksum is reported first: all other errors of a corrupted message are consequences.
 fn decode_payload<M: Payload>(header: &Header, mut reader: PayloadReader<'_>, limits: &Limits) -> Result<M, WireError> {
     let parts = read_parts::<M>(header, &mut reader, limits);
     let expected = reader.finish();
     if expected != header.payload_crc {
         return Err(WireError::Checksum { expected, found: header.payload_crc });
     }
-    let (metadata, body, sound) = parts?;
-    if !sound {
+    let (metadata, body, valid) = parts?;
+    if !valid {
         check_body(&body, limits.max_abs_value)?;
     }
     M::from_parts(metadata, body)
@@ -194,6 +199,6 @@ fn read_parts<M: Payload>(
 ) -> Result<(M::Metadata, Body, bool), WireError> {
     let metadata: M::Metadata = metadata::decode(M::KIND, &reader.read_bytes(header.metadata_len as usize))?;
     let shape = M::check(&metadata, limits)?;
-    let (body, sound) = reader.read_body(header.body_len, shape, limits.max_abs_value)?;
-    Ok((metadata, body, sound))
+    let (body, valid) = reader.read_body(header.body_len, shape, limits.max_abs_value)?;
+    Ok((metadata, body, valid))
 }

@@ -1,6 +1,6 @@
-//! Any bytes may come: none of them panics, none is taken for what its sender did not seal.
+//! Hostile input: any bytes may arrive; none panics, and only messages that their sender sealed are accepted.
 //!
-//! `PROPTEST_CASES=1000000 cargo test --release -p protocol --test hostile` tries harder.
+//! `PROPTEST_CASES=1000000 cargo test --release -p protocol --test hostile` tests more cases.
 
 mod sample;
 
@@ -22,7 +22,7 @@ fn decode(bytes: &[u8]) -> Result<(Header, Message), WireError> {
     wire::decode_any([bytes], &Limits::DEFAULT)
 }
 
-/// Puts lengths and checksums right again, so that what follows them is put to the test.
+/// Updates lengths and checksums, so that the checks behind them are tested.
 fn reseal(bytes: &mut [u8], metadata_len: Option<u32>) {
     if bytes.len() < HEADER_LEN {
         return;
@@ -76,7 +76,7 @@ fn every_flipped_bit_is_noticed() {
 }
 
 #[test]
-fn fifteen_bytes_that_claim_2_to_the_42_change_nothing() {
+fn fifteen_bytes_that_claim_2_to_the_42_are_rejected() {
     let mut bytes = [0; 15];
     bytes[..8].copy_from_slice(&(1u64 << 42).to_le_bytes());
     assert!(matches!(decode(&bytes), Err(WireError::Truncated { expected: 92, found: 15 })));
@@ -114,7 +114,7 @@ fn absurd_shapes_in_the_metadata_are_refused() {
         assert!(matches!(absurd_map(huge, u32::MAX, Selection::Dense, packing), WireError::Limit { .. }));
         assert!(matches!(absurd_map(huge, 1, none, packing), WireError::Limit { what: "grid cells", .. }));
         assert!(matches!(absurd_map(grid, u32::MAX, none, packing), WireError::Limit { what: "channels", .. }));
-        // 4 GiB unpacked, from nothing at all.
+        // 4 GiB decompressed, from an empty body.
         assert!(matches!(absurd_map(large, 1024, none, packing), WireError::Limit { what: "feature map bytes", .. }));
         let all_and_one = Selection::TopK { cells: grid.cells() as u32 + 1 };
         assert!(matches!(absurd_map(grid, 1, all_and_one, packing), WireError::Limit { what: "selected cells", .. }));
@@ -128,11 +128,11 @@ fn absurd_shapes_in_the_metadata_are_refused() {
 }
 
 #[test]
-fn a_code_stands_for_a_map_of_no_fewer_channels_and_no_more_than_are_taken() {
+fn a_code_has_no_more_channels_than_its_map_and_the_map_no_more_than_the_limit() {
     for (widened, is_right) in [(2, false), (3, true), (1024, true), (1025, false), (u32::MAX, false)] {
-        let mut bev = sample::squeezed_bev();
+        let mut bev = sample::compressed_bev();
         bev.features.code_of = Some(widened);
-        // What no sender writes, a forger does.
+        // An attacker can write a message that the encoder rejects.
         let encoded = wire::encode(&sample::stamp(), bev);
         assert_eq!(encoded.is_ok(), widened > 2, "{widened}");
         let Ok(encoded) = encoded else { continue };
@@ -164,7 +164,7 @@ fn smaller_limits_are_kept_too() {
 }
 
 #[test]
-fn numbers_that_are_none_never_arrive() {
+fn numbers_that_are_not_finite_are_never_accepted() {
     for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, 1e30] {
         let mut features = sample::features();
         features.values[500] = bad;
@@ -197,7 +197,7 @@ enum Mutation {
 }
 
 fn any_mutation() -> impl Strategy<Value = Mutation> {
-    // The ends of what integers, varints, floats and halves can say.
+    // Limits of integers, varints, floats and halves.
     let numbers = vec![
         0,
         1,
@@ -253,10 +253,10 @@ impl Mutation {
     }
 }
 
-/// What was accepted must be sound through and through: it can be used, and sent on, and comes back the same.
+/// An accepted message must be valid: it can be used and encoded, and decodes to the same message.
 fn check_accepted(message: Message) -> Result<(), TestCaseError> {
-    let bytes = wire::encode_any(&sample::stamp(), message.clone()).expect("sound").to_vec();
-    prop_assert_eq!(&decode(&bytes).expect("sound").1, &message);
+    let bytes = wire::encode_any(&sample::stamp(), message.clone()).expect("valid").to_vec();
+    prop_assert_eq!(&decode(&bytes).expect("valid").1, &message);
     if let Message::Bev(bev) = message
         && let Ok(decoded) = bev.features.decode(&Limits::DEFAULT)
     {
@@ -276,7 +276,7 @@ proptest! {
     }
 
     #[test]
-    fn random_payloads_under_a_sound_header_do_no_harm(kind in 1..=12u8, metadata_len in 0..200u32, payload in vec(any::<u8>(), 0..400)) {
+    fn random_payloads_under_a_valid_header_are_harmless(kind in 1..=12u8, metadata_len in 0..200u32, payload in vec(any::<u8>(), 0..400)) {
         let mut bytes = wire::encode(&sample::stamp(), sample::pose()).unwrap().head;
         bytes.truncate(HEADER_LEN);
         bytes[6] = kind;
@@ -296,7 +296,7 @@ proptest! {
     }
 
     #[test]
-    fn changed_and_resealed_messages_do_no_harm(message in any_message(), mutations in vec(any_mutation(), 1..6), anywhere: bool) {
+    fn changed_and_resealed_messages_are_harmless(message in any_message(), mutations in vec(any_mutation(), 1..6), anywhere: bool) {
         let mut bytes = wire::encode_any(&sample::stamp(), message).unwrap().to_vec();
         let begin = if anywhere { 0 } else { HEADER_LEN };
         mutations.iter().for_each(|mutation| mutation.apply(&mut bytes, begin));

@@ -1,4 +1,4 @@
-//! What a peer can make a receiver hold: measured, on Linux, as the process's peak.
+//! Memory that a peer can make a receiver allocate: measured, on Linux, as the process's peak.
 #![cfg(target_os = "linux")]
 
 mod sample;
@@ -19,18 +19,18 @@ fn resident(field: &str) -> u64 {
     line.trim_start_matches(':').trim().trim_end_matches(" kB").parse::<u64>().unwrap() * 1024
 }
 
-/// `[1024, 32, 64]`: 8 MiB as `f32`, the most the limits allow.
+/// `[1024, 32, 64]`: 8 MiB as `f32`, the maximum of the limits.
 fn largest_map(dtype: Dtype, selection: Selection, packing: Compression, body: Vec<u8>) -> EncodedFeatures {
     let grid = BevGrid { width: 64, height: 32, ..sample::grid() };
     let codec = Codec { dtype, selection, packing };
     EncodedFeatures { grid, channels: 1024, code_of: None, codec, rate: None, body: Body::Bytes(body) }
 }
 
-/// A zstd frame of zeros, written in small parts so that making it takes no memory.
+/// A zstd frame of zeros, written in small parts so that making it allocates little memory.
 fn zeros(bytes: u64) -> Vec<u8> {
     let mut encoder = zstd::stream::Encoder::new(Vec::new(), 3).unwrap();
     encoder.set_pledged_src_size(Some(bytes)).unwrap();
-    // 128 MiB of window, where they are kept.
+    // 128 MiB of window, the size of the decoder's buffer.
     encoder.window_log(27).unwrap();
     for _ in 0..bytes / (64 << 10) {
         encoder.write_all(&[0; 64 << 10]).unwrap();
@@ -38,7 +38,7 @@ fn zeros(bytes: u64) -> Vec<u8> {
     encoder.finish().unwrap()
 }
 
-/// A message whose metadata are a claim of 2^42 elements and nothing behind it.
+/// A message whose metadata claim 2^42 elements without content.
 fn claim(kind: u8, before: &[u8], body_len: u64) -> Vec<u8> {
     let mut bytes = wire::encode(&sample::stamp(), sample::pose()).unwrap().head;
     bytes.truncate(HEADER_LEN);
@@ -57,18 +57,18 @@ fn claim(kind: u8, before: &[u8], body_len: u64) -> Vec<u8> {
 }
 
 #[test]
-fn claims_take_no_memory_and_bombs_at_most_twice_the_limit() {
+fn claims_allocate_no_memory_and_bombs_at_most_twice_the_limit() {
     let (small_bomb, bomb) = (zeros(8 * MIB), zeros(1024 * MIB));
     let no_pose = [1, 0, 0];
     let claims = [
-        // Points of a sweep, detections behind a pose, objects of a truth, a body as large as allowed.
+        // Points of a sweep, detections behind a pose, objects of a truth, a body of the maximum size.
         claim(1, &[], 0),
         claim(6, &no_pose, 0),
         claim(10, &[0], 0),
         claim(1, &[], 8 * MIB),
         claim(12, &[1, b'x'], 0),
     ];
-    // 5: the peak begins anew.
+    // 5: resets the peak.
     std::fs::write("/proc/self/clear_refs", "5").unwrap();
     let before = resident("VmRSS");
 

@@ -1,4 +1,4 @@
-//! What goes in comes out: every kind, every codec, however the network cuts it.
+//! Round trip of messages: every kind and every codec, from pieces of any size.
 
 mod sample;
 
@@ -54,7 +54,7 @@ fn a_message_of_another_kind_is_refused() {
 }
 
 #[test]
-fn detections_json_is_what_scripts_read() {
+fn detections_json_is_stable() {
     let json = DetectionsReport::new(&sample::stamp(), Some(7), sample::detections()).to_json();
     let value: serde_json::Value = serde_json::from_str(&json).unwrap();
     assert_eq!((&value["tick"], &value["agent_frame"]), (&7.into(), &3.into()));
@@ -115,7 +115,7 @@ proptest! {
         let sent = sent.unwrap_or_else(|| vec![true; cells]);
         let least_sent = (0..cells).filter(|cell| sent[*cell]).map(|cell| confidence[cell]).fold(1.0, f32::min);
         let most_kept = (0..cells).filter(|cell| !sent[*cell]).map(|cell| confidence[cell]).fold(0.0, f32::max);
-        // A window judges cells by what is around them.
+        // A smoothing window selects cells by their surroundings.
         let is_smoothed = config.gate.is_some_and(|gate| gate.smoothing.is_some());
         prop_assert!(is_smoothed || most_kept <= least_sent);
         for (before, after) in values.chunks(cells).zip(back.values.chunks(cells)) {

@@ -9,7 +9,7 @@ use support::cli::exit_code;
 
 use crate::command;
 
-/// Scenes: look into recorded ones, generate new ones, stream either as live traffic, record what comes of it.
+/// Scenes: inspect recorded ones, generate new ones, stream either as live traffic, record a run.
 #[derive(Debug, Parser)]
 #[command(
     version,
@@ -33,7 +33,7 @@ enum Command {
     Synth(command::synth::Args),
 }
 
-/// RunScope what was asked for.
+/// Runs the selected sub-command.
 pub(crate) fn run(cli: Cli) -> ExitCode {
     let outcome = match cli.command {
         Command::Convert(args) => command::convert::run(&args),

@@ -1,7 +1,7 @@
-//! The air between the agents of a live run and one ego.
+//! Link process: link emulation between the agents of a live run and one ego.
 //!
-//! What agents publish is taken in as it comes, kept for as long as the [`LinkEmulator`] says, and published under
-//! `rx/<ego>/<cav>/<stream>` as it was, stamp and all. One thread receives and decides; sending has threads of its own.
+//! Messages of agents are received, kept until the [`LinkEmulator`] delivers them, and published unchanged, stamp
+//! included, under `rx/<ego>/<cav>/<stream>`. One thread receives and decides; sending has its own threads.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -16,71 +16,71 @@ use bus::{Arrival, Bus, BusError, Event, Inbox, InboxLimits, Membership, Publish
 use link::{Delivery, LinkEmulator, Outcome, Packet};
 use support::nanos;
 
-/// Messages of one topic that may wait to be looked at, and that may wait to be passed on.
+/// Messages of one topic that may wait for processing, and that may wait for forwarding.
 const PLACES: usize = 64;
-/// Vehicles that a link carries at most.
+/// Largest number of vehicles of a link.
 const MAX_VEHICLES: usize = 64;
-/// Vehicles that are remembered for having been turned away, so that the log names each once.
-const MAX_TURNED_AWAY: usize = 1024;
-/// Messages that are under way for longer at the end are of no use to anybody any more, milliseconds.
+/// Largest number of rejected vehicles that are remembered, so that the log reports each once.
+const MAX_REJECTED: usize = 1024;
+/// Messages in flight for longer than this at the end count as stuck, milliseconds.
 const STUCK_MS: u64 = 5_000;
-/// How often the node looks for newcomers though nothing happens.
-const LOOK_ROUND: Duration = Duration::from_millis(20);
+/// Interval at which the node checks the membership without incoming messages.
+const MEMBERSHIP_PERIOD: Duration = Duration::from_millis(20);
 
-/// What a link carries.
+/// Options of the link process.
 #[derive(Debug, Clone)]
 pub struct NodeOptions {
-    /// Who receives.
+    /// The receiving ego.
     pub ego: CavId,
-    /// What agents send.
+    /// Streams that are forwarded.
     pub streams: Vec<Stream>,
-    /// Whether to go on when all agents have ended, for the next ones.
+    /// True to continue when all agents have ended, for the next ones.
     pub keeps_running: bool,
-    /// Bytes of messages that are kept at most: under a long delay the air itself has no bound.
+    /// Largest number of bytes of kept messages: under a long delay the emulator itself has no limit.
     pub max_kept_bytes: u64,
-    /// What each topic may bring, and what may wait to be looked at.
+    /// Limits per topic, and of messages that wait for processing.
     pub inbox: InboxLimits,
 }
 
 impl NodeOptions {
-    /// Until all agents of a run have ended, with at most 1 GiB on the way.
+    /// Until all agents of a run have ended, with at most 1 GiB in flight.
     #[must_use]
     pub const fn new(ego: CavId, streams: Vec<Stream>) -> Self {
         Self { ego, streams, keeps_running: false, max_kept_bytes: 1 << 30, inbox: InboxLimits::PEERS }
     }
 }
 
-/// What became of the messages.
+/// Message counters of the link.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
 pub struct LinkReport {
-    /// Messages that agents sent.
+    /// Messages from agents.
     pub offered: u64,
-    /// Of these, passed on.
+    /// Of these, forwarded.
     pub arrived: u64,
-    /// Passed on a second time.
+    /// Forwarded a second time.
     pub copies: u64,
-    /// Not passed on.
+    /// Not forwarded, by reason.
     pub dropped: BTreeMap<DropReason, u64>,
-    /// Still under way at the end.
+    /// Still in flight at the end.
     pub under_way: u64,
-    /// For how long the oldest of these was, milliseconds.
+    /// Longest time in flight of these, milliseconds.
     pub longest_ms: u64,
 }
 
 impl LinkReport {
-    /// Whether what is still under way is so because the run has ended, and not because the link carries nothing.
+    /// True if messages are still in flight only because the run has ended, and not because the link is stuck.
     #[must_use]
     pub fn is_complete(&self) -> bool {
         self.longest_ms <= STUCK_MS
     }
 }
 
-/// Carries messages until all agents have ended and everything has arrived, or `stop` is requested.
+/// Forwards messages until all agents have ended and everything has arrived, or `stop` is requested.
 ///
 /// # Errors
-/// [`BusError`] when the bus refuses. What is wrong with single messages is counted and logged.
-pub fn run(bus: &Bus, air: LinkEmulator, options: &NodeOptions, stop: &Stop) -> Result<LinkReport, BusError> {
-    let mut node = Node::open(bus, air, options, stop)?;
+/// [`BusError`] if the bus fails. Faults of single messages are counted and logged.
+pub fn run(bus: &Bus, emulator: LinkEmulator, options: &NodeOptions, stop: &Stop) -> Result<LinkReport, BusError> {
+    let mut node = Node::open(bus, emulator, options, stop)?;
     let presence = bus.announce(Role::Link)?;
     node.carry(stop)?;
     let Node { vehicles, kept, mut report, .. } = node;
@@ -95,54 +95,54 @@ pub fn run(bus: &Bus, air: LinkEmulator, options: &NodeOptions, stop: &Stop) -> 
     Ok(report)
 }
 
-/// One agent, or the ego, of whom only the place is of interest.
+/// One agent, or the ego, of which only the position is used.
 struct Vehicle {
     publishers: BTreeMap<Stream, Publisher>,
     /// Streams that have ended.
     ended: BTreeSet<Stream>,
     position_m: Option<[f64; 3]>,
-    /// Whether it has vanished: a newcomer may have its place.
-    is_gone: bool,
+    /// True if it has left: a new vehicle may replace it.
+    has_left: bool,
     _subscriptions: Vec<Subscription>,
 }
 
 struct Node<'a> {
     bus: &'a Bus,
-    air: LinkEmulator,
+    emulator: LinkEmulator,
     options: &'a NodeOptions,
     inbox: Arc<Inbox>,
-    roll_call: Membership,
+    membership: Membership,
     vehicles: BTreeMap<CavId, Vehicle>,
-    /// For whom there was no place.
-    turned_away: BTreeSet<CavId>,
-    /// Messages that are under way.
+    /// Vehicles rejected because all slots are taken.
+    rejected: BTreeSet<CavId>,
+    /// Messages in flight, by id.
     kept: BTreeMap<u64, Arrival>,
-    /// Their bytes.
+    /// Total bytes of the kept messages.
     kept_bytes: u64,
     next_id: u64,
-    /// When the first message came: time 0 of the air.
+    /// Time of arrival of the first message: time 0 of the emulator.
     began: Option<Instant>,
-    /// Capture time of the first, from which clocks drift.
+    /// Capture time of the first message, from which clocks drift.
     began_nanos: Option<u64>,
     report: LinkReport,
 }
 
 impl<'a> Node<'a> {
-    fn open(bus: &'a Bus, air: LinkEmulator, options: &'a NodeOptions, stop: &Stop) -> Result<Self, BusError> {
+    fn open(bus: &'a Bus, emulator: LinkEmulator, options: &'a NodeOptions, stop: &Stop) -> Result<Self, BusError> {
         let inbox = bus.limited_inbox(PLACES, MAX_VEHICLES * (options.streams.len() + 1), options.inbox);
         stop.on_request({
             let inbox = Arc::clone(&inbox);
             move || inbox.close()
         });
-        let roll_call = Membership::begin(bus, Role::Agent, 2 * MAX_VEHICLES)?;
+        let membership = Membership::begin(bus, Role::Agent, 2 * MAX_VEHICLES)?;
         Ok(Self {
             bus,
-            air,
+            emulator,
             options,
             inbox,
-            roll_call,
+            membership,
             vehicles: BTreeMap::new(),
-            turned_away: BTreeSet::new(),
+            rejected: BTreeSet::new(),
             kept: BTreeMap::new(),
             kept_bytes: 0,
             next_id: 0,
@@ -155,7 +155,7 @@ impl<'a> Node<'a> {
     fn carry(&mut self, stop: &Stop) -> Result<(), BusError> {
         let _working = self.bus.works_from(&self.inbox);
         while !stop.requested() {
-            self.look_round()?;
+            self.update_membership()?;
             match self.inbox.take(Some(self.next_moment())) {
                 Pop::Item(Topic::Stream { cav, stream: Stream::Gnss }, Event::Message(arrival)) => {
                     self.locate(&cav, &arrival);
@@ -185,47 +185,47 @@ impl<'a> Node<'a> {
             && self.kept.is_empty()
     }
 
-    /// Follows up on who came and went.
-    fn look_round(&mut self) -> Result<(), BusError> {
-        while let Some((cav, is_there)) = self.roll_call.next() {
+    /// Processes vehicles that joined or left.
+    fn update_membership(&mut self) -> Result<(), BusError> {
+        while let Some((cav, is_there)) = self.membership.next() {
             match self.vehicles.get_mut(&cav) {
                 Some(vehicle) if is_there => {
-                    // It was away and sends again.
+                    // It was offline and sends again.
                     vehicle.ended.clear();
-                    vehicle.is_gone = false;
+                    vehicle.has_left = false;
                 }
                 Some(vehicle) => {
-                    // What it sent before may still be under way.
+                    // Its earlier messages may still be in flight.
                     vehicle.ended.extend(self.options.streams.iter().copied());
-                    vehicle.is_gone = true;
+                    vehicle.has_left = true;
                 }
-                None if is_there => self.welcome(cav)?,
+                None if is_there => self.add(cav)?,
                 None => {}
             }
         }
         Ok(())
     }
 
-    /// Gives a newcomer a place; where all are taken, that of one who has gone.
-    fn welcome(&mut self, cav: CavId) -> Result<(), BusError> {
+    /// Adds a new vehicle; if all slots are taken, it replaces one that has left.
+    fn add(&mut self, cav: CavId) -> Result<(), BusError> {
         if self.vehicles.len() >= MAX_VEHICLES {
             let has_kept = |cav: &CavId| self.kept.values().any(|arrival| arrival.header.stamp.cav == *cav);
             let Some(gone) = place_to_free(&self.vehicles, &self.options.ego, has_kept).cloned() else {
-                self.turn_away(cav);
+                self.reject(cav);
                 return Ok(());
             };
             self.vehicles.remove(&gone);
         }
         let vehicle = self.attach(&cav)?;
-        tracing::info!(%cav, "its messages cross the link");
+        tracing::info!(%cav, "its messages are forwarded");
         self.vehicles.insert(cav, vehicle);
         Ok(())
     }
 
-    fn turn_away(&mut self, cav: CavId) {
-        if self.turned_away.len() < MAX_TURNED_AWAY && !self.turned_away.contains(&cav) {
-            tracing::warn!(%cav, "its messages do not cross the link, which carries at most {MAX_VEHICLES} vehicles");
-            self.turned_away.insert(cav);
+    fn reject(&mut self, cav: CavId) {
+        if self.rejected.len() < MAX_REJECTED && !self.rejected.contains(&cav) {
+            tracing::warn!(%cav, "its messages are not forwarded: the link carries at most {MAX_VEHICLES} vehicles");
+            self.rejected.insert(cav);
         }
     }
 
@@ -233,20 +233,20 @@ impl<'a> Node<'a> {
         let subscribe = |stream| self.bus.subscribe(Topic::Stream { cav: cav.clone(), stream }, &self.inbox);
         let mut subscriptions = vec![subscribe(Stream::Gnss)?];
         let mut publishers = BTreeMap::new();
-        // An ego hears its own agent without any air between.
+        // The link does not apply to the ego's own agent.
         let streams = if *cav == self.options.ego { &[][..] } else { &self.options.streams };
         for &stream in streams {
             subscriptions.push(subscribe(stream)?);
             let topic = Topic::Received { ego: self.options.ego.clone(), cav: cav.clone(), stream };
             let how = if stream == Stream::Pose { PublisherOptions::POSE } else { PublisherOptions::FEATURES };
-            // The air has decided what is lost; after it nothing is.
+            // The emulator decides the losses; forwarding is lossless.
             publishers.insert(stream, self.bus.publisher(topic, how.lossless(PLACES))?);
         }
-        let (ended, position_m, is_gone) = (BTreeSet::new(), None, false);
-        Ok(Vehicle { publishers, ended, position_m, is_gone, _subscriptions: subscriptions })
+        let (ended, position_m, has_left) = (BTreeSet::new(), None, false);
+        Ok(Vehicle { publishers, ended, position_m, has_left, _subscriptions: subscriptions })
     }
 
-    /// Takes note of where a vehicle is: loss may depend on distance.
+    /// Records the position of a vehicle: loss may depend on distance.
     fn locate(&mut self, cav: &CavId, arrival: &Arrival) {
         let Some(Gnss { world_from_lidar, .. }) = self.inbox.decode(arrival, &Limits::DEFAULT) else { return };
         self.bus.books().received(&arrival.topic);
@@ -260,18 +260,18 @@ impl<'a> Node<'a> {
         let distance_m = self.distance_m(&from);
         self.report.offered += 1;
         match self.vehicles.get_mut(&from) {
-            // The end that was heard was that of an earlier life, which can come after the news of the next one.
+            // The end was that of the previous process instance; it can arrive after the first message of the new one.
             Some(vehicle) => {
                 vehicle.ended.remove(&stream);
             }
-            // It has gone, and its place is another's.
+            // It has left, and another vehicle has replaced it.
             None => return self.lose(&arrival, DropReason::PeerOffline),
         }
         if self.kept_bytes.saturating_add(arrival.wire_bytes()) > self.options.max_kept_bytes {
             return self.lose(&arrival, DropReason::LinkQueue);
         }
         self.kept_bytes += arrival.wire_bytes();
-        self.air.offer(Packet {
+        self.emulator.offer(Packet {
             id: self.next_id,
             from,
             to: self.options.ego.clone(),
@@ -285,7 +285,7 @@ impl<'a> Node<'a> {
         self.next_id += 1;
     }
 
-    /// Between a sender and the ego; 0 while either's place is not known.
+    /// Distance between a sender and the ego, metres; 0 while either position is unknown.
     fn distance_m(&self, from: &CavId) -> f64 {
         let position = |cav: &CavId| self.vehicles.get(cav).and_then(|vehicle| vehicle.position_m);
         match (position(from), position(&self.options.ego)) {
@@ -294,30 +294,32 @@ impl<'a> Node<'a> {
         }
     }
 
-    /// Passes on what has arrived by now.
+    /// Forwards the messages that have arrived by now.
     fn settle(&mut self) {
         let Some(began) = self.began else { return };
-        for Outcome { parcel, fate, .. } in self.air.advance(nanos::between(began, Instant::now())) {
-            match fate {
+        for Outcome { parcel: packet, fate: delivery, .. } in
+            self.emulator.advance(nanos::between(began, Instant::now()))
+        {
+            match delivery {
                 Delivery::Dropped(reason) => {
-                    if let Some(lost) = self.release(parcel.id) {
+                    if let Some(lost) = self.release(packet.id) {
                         self.lose(&lost, reason);
                     }
                 }
-                Delivery::Arrived { is_copy, is_repeated } => self.pass_on(&parcel, is_copy, is_repeated),
+                Delivery::Arrived { is_copy, is_repeated } => self.forward(&packet, is_copy, is_repeated),
             }
         }
     }
 
-    fn pass_on(&mut self, parcel: &Packet, is_copy: bool, is_repeated: bool) {
-        let publisher = self.vehicles.get(&parcel.from).and_then(|vehicle| vehicle.publishers.get(&parcel.stream));
-        let (Some(publisher), Some(arrival)) = (publisher, self.kept.get(&parcel.id)) else { return };
+    fn forward(&mut self, packet: &Packet, is_copy: bool, is_repeated: bool) {
+        let publisher = self.vehicles.get(&packet.from).and_then(|vehicle| vehicle.publishers.get(&packet.stream));
+        let (Some(publisher), Some(arrival)) = (publisher, self.kept.get(&packet.id)) else { return };
         match arrival.header.stamp.capture_nanos {
-            // What tells of no moment has no capture time.
+            // A message without capture time.
             0 => publisher.relay(arrival),
             scene_nanos => {
                 let began_nanos = *self.began_nanos.get_or_insert(scene_nanos);
-                publisher.relay_as(arrival, self.air.clock().shown_since(began_nanos, scene_nanos));
+                publisher.relay_as(arrival, self.emulator.clock().shown_since(began_nanos, scene_nanos));
             }
         }
         if is_copy {
@@ -327,17 +329,17 @@ impl<'a> Node<'a> {
             self.bus.books().received(&arrival.topic);
         }
         if !is_repeated {
-            self.release(parcel.id);
+            self.release(packet.id);
         }
     }
 
-    /// Counts a message that is not passed on.
+    /// Counts a message that is not forwarded.
     fn lose(&mut self, arrival: &Arrival, reason: DropReason) {
         *self.report.dropped.entry(reason).or_default() += 1;
         self.bus.books().dropped(&arrival.topic, reason);
     }
 
-    /// Keeps a message no longer.
+    /// Removes a kept message.
     fn release(&mut self, id: u64) -> Option<Arrival> {
         let released = self.kept.remove(&id)?;
         self.kept_bytes = self.kept_bytes.saturating_sub(released.wire_bytes());
@@ -345,19 +347,19 @@ impl<'a> Node<'a> {
     }
 
     fn next_moment(&self) -> Instant {
-        let soon = Instant::now() + LOOK_ROUND;
-        let next = self.began.zip(self.air.next_nanos()).map(|(began, nanos)| began + Duration::from_nanos(nanos));
+        let soon = Instant::now() + MEMBERSHIP_PERIOD;
+        let next = self.began.zip(self.emulator.next_nanos()).map(|(began, nanos)| began + Duration::from_nanos(nanos));
         next.map_or(soon, |next| next.min(soon))
     }
 }
 
-/// Someone who has vanished and of whom nothing is under way any more; never the ego, whose place in the world counts.
+/// A vehicle that has left and has no message in flight; never the ego, whose position is needed.
 fn place_to_free<'v>(
     vehicles: &'v BTreeMap<CavId, Vehicle>,
     ego: &CavId,
     has_kept: impl Fn(&CavId) -> bool,
 ) -> Option<&'v CavId> {
-    let is_free = |(cav, vehicle): &(&CavId, &Vehicle)| vehicle.is_gone && *cav != ego && !has_kept(cav);
+    let is_free = |(cav, vehicle): &(&CavId, &Vehicle)| vehicle.has_left && *cav != ego && !has_kept(cav);
     vehicles.iter().find(is_free).map(|(cav, _)| cav)
 }
 
@@ -366,13 +368,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_place_of_one_who_has_gone_for_good_is_free() {
+    fn the_slot_of_a_vehicle_that_has_left_is_free() {
         let cav = |id: usize| CavId::new(&id.to_string()).unwrap();
-        let vehicle = |is_gone| Vehicle {
+        let vehicle = |has_left| Vehicle {
             publishers: BTreeMap::new(),
             ended: BTreeSet::new(),
             position_m: None,
-            is_gone,
+            has_left,
             _subscriptions: Vec::new(),
         };
         let mut vehicles: BTreeMap<CavId, Vehicle> = (0..4).map(|id| (cav(id), vehicle(id < 3))).collect();

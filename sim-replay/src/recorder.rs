@@ -1,4 +1,4 @@
-//! A process that writes a live run down.
+//! Recorder: writes the messages of a live run to a file.
 
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
@@ -13,51 +13,51 @@ use recording::{RecordingError, RecordingOptions, RecordingWriter};
 
 /// Messages of one key that may wait for the disk.
 const PLACES: usize = 64;
-/// A chunk is closed after this long even if it is small: what a crash costs.
+/// A chunk is closed after this time even if it is small: the largest loss of a crash.
 const FLUSH_PERIOD: Duration = Duration::from_secs(1);
-/// How long a run whose replay has ended may still have something to say.
+/// Time after the end of the replay during which messages of the run may still arrive.
 const LAST_WORDS: Duration = Duration::from_secs(3);
 
-/// What to record.
+/// Options of the recorder.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct RecorderOptions {
     /// The new file.
     pub out: PathBuf,
-    /// How to write it.
+    /// Options of the file.
     pub recording: RecordingOptions,
-    /// Streams to leave out, before and behind the link: maps, for example, are most of the bytes.
+    /// Streams to leave out, before and after the link: feature maps, for example, are most of the bytes.
     pub without: Vec<Stream>,
-    /// Whether to go on when the replay has ended, for the next one.
+    /// True to continue when the replay has ended, for the next one.
     pub keeps_running: bool,
 }
 
-/// How a recording went.
+/// Report of a recording.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct RecordReport {
     /// The file.
     pub file: PathBuf,
-    /// Messages of the run that are in it.
+    /// Messages of the run in the file.
     pub messages: u64,
-    /// Its size.
+    /// Size of the file.
     pub bytes: u64,
-    /// From the first message to the last that is in it, seconds.
+    /// Time from the first to the last message in the file, seconds.
     pub seconds: f64,
-    /// Messages that came faster than they could be written.
+    /// Messages lost because they arrived faster than they could be written.
     pub overwritten: u64,
-    /// Messages that came after writing had failed, or were in the chunk with which it did.
+    /// Messages that arrived after writing had failed, or were in the chunk that failed.
     pub not_written: u64,
-    /// Why writing failed.
+    /// Reason of the failure.
     pub failure: Option<String>,
 }
 
 impl RecordReport {
-    /// Whether everything that came is in the file.
+    /// True if all received messages are in the file.
     #[must_use]
     pub fn is_complete(&self) -> bool {
         self.overwritten == 0 && self.not_written == 0 && self.failure.is_none()
     }
 
-    /// What is missing in the file, in words; `None` where nothing is.
+    /// Description of the missing messages; `None` if there are none.
     #[must_use]
     pub fn loss_in_words(&self) -> Option<String> {
         let Self { file, messages, seconds, overwritten, not_written, failure, .. } = self;
@@ -75,22 +75,22 @@ impl RecordReport {
     }
 }
 
-/// Why a recording could not begin.
+/// Reasons why a recording could not begin.
 #[derive(Debug, thiserror::Error)]
 pub enum RecorderError {
     /// The file cannot be written.
     #[error(transparent)]
     Recording(#[from] RecordingError),
-    /// The bus refuses.
+    /// The bus failed.
     #[error(transparent)]
     Bus(#[from] BusError),
 }
 
-/// Records the run of `bus` until it is over or `stop` is requested. When the disk is full, or refuses for any other
-/// reason, `on_failure` is told once, the run goes on, and what would have been recorded is counted.
+/// Records the run of `bus` until it ends or `stop` is requested. If writing fails (full disk, for example),
+/// `on_failure` is called once, the run continues, and the messages not recorded are counted.
 ///
 /// # Errors
-/// [`RecorderError`] when the recording cannot begin.
+/// [`RecorderError`] if the recording cannot begin.
 pub fn record(
     bus: &Bus,
     options: &RecorderOptions,
@@ -99,9 +99,9 @@ pub fn record(
 ) -> Result<RecordReport, RecorderError> {
     let (writer, failure) = match RecordingWriter::create(&options.out, options.recording) {
         Ok(writer) => (Some(writer), None),
-        // A run that waits for its recorder is not to wait in vain.
+        // A run that waits for its recorder must not wait forever.
         Err(error) if options.keeps_running => {
-            tracing::error!("nothing is recorded, the run goes on: {error}");
+            tracing::error!("nothing is recorded, the run continues: {error}");
             (None, Some(in_words(&error)))
         }
         Err(error) => return Err(error.into()),
@@ -141,11 +141,11 @@ struct Recorder<'a> {
     writer: Option<RecordingWriter<std::fs::File>>,
     without: &'a [Stream],
     run: &'a RunId,
-    /// When the replay said that it was over.
+    /// Time at which the replay reported its end.
     over: Option<Instant>,
-    /// Messages that were to be written.
+    /// Messages received for writing.
     taken: u64,
-    /// When the first of them and the last one arrived, nanoseconds.
+    /// Times of arrival of the first and the last of them, nanoseconds.
     span: Option<(u64, u64)>,
     on_failure: &'a mut dyn FnMut(&RecordReport),
     report: RecordReport,
@@ -198,7 +198,7 @@ impl Recorder<'_> {
             self.report.seconds = self.span.map_or(0.0, |(first, last)| last.saturating_sub(first) as f64 * 1e-9);
         }
         if let Err(error) = written {
-            tracing::error!("the recording ends here, the run goes on: {error}");
+            tracing::error!("the recording ends here, the run continues: {error}");
             self.report.failure = Some(in_words(&error));
             self.report.not_written = self.taken - self.report.messages;
             self.writer = None;
@@ -221,7 +221,7 @@ impl Recorder<'_> {
     }
 }
 
-/// Why writing failed, without the file, which stands in the report.
+/// Reason of the failure, without the file, which is in the report.
 fn in_words(error: &RecordingError) -> String {
     match error {
         RecordingError::Io { source, .. } if source.kind() == std::io::ErrorKind::StorageFull => "disk full".into(),

@@ -1,7 +1,7 @@
-//! What faults do to a fleet, how fast it starts and ends, and whether it can run for long.
+//! Benchmark of a fleet under faults: gaps between results, recovery, start and end, and long runs.
 //!
-//! Four vehicles at 10 Hz with recorded poses and a small network, so that two cores are enough; every process is the real
-//! program, and they meet over cables that can be cut.
+//! Four vehicles at 10 Hz with recorded poses and a small network, so that two cores are enough; every process is the
+//! real program, and they connect over virtual links that can be cut.
 //!
 //! ```text
 //! cargo build --release --workspace --bins
@@ -11,7 +11,8 @@
 //! cargo bench -p tests --bench faults -- --soak 3600               # an hour
 //! ```
 //!
-//! Prints a line per fault to standard error and the summary, in Markdown, to standard output. Fails where a target is missed.
+//! Prints a line per fault to standard error and the summary, in Markdown, to standard output. Fails when a target is
+//! missed.
 
 use std::time::Duration;
 
@@ -23,7 +24,7 @@ use tests::machine;
 fn main() -> Result<()> {
     let arguments: Vec<String> = std::env::args().skip(1).filter(|argument| argument != "--bench").collect();
     let pairs = arguments.chunks(2).map(pair).collect::<Result<Vec<_>>>()?;
-    // Wherever it stands among them.
+    // At any position among them.
     let seed = pairs.iter().rfind(|(name, _)| *name == "--seed").map_or(1, |(_, seed)| *seed);
     let mut misses = Vec::new();
     println!("{}\n", machine::describe());
@@ -49,7 +50,7 @@ fn pair(arguments: &[String]) -> Result<(&str, u64)> {
     Ok((name, value.parse().with_context(|| format!("{name} {value}"))?))
 }
 
-/// The names of the targets that do not hold.
+/// Names of the targets that were missed.
 fn missed(targets: &[(bool, String)]) -> Vec<String> {
     for (holds, target) in targets {
         println!("- {target}: {}", if *holds { "yes" } else { "**no**" });
@@ -71,11 +72,11 @@ fn under_faults(seed: u64, count: usize) -> Vec<String> {
     println!("## {count} faults, seed {seed}\n");
     println!("{restarts} restarts; slowest to be as before: {} ms ({})", slowest.0, slowest.1);
     println!(
-        "first message of a new life to first result with it: median {} ms, 95 % {} ms",
+        "first message of a new instance to first result with it: median {} ms, 95th percentile {} ms",
         quantile(0.5),
         quantile(0.95)
     );
-    println!("{exempted} messages exempted, as one they concern was away; {differences}");
+    println!("{exempted} messages exempt, as a process that they concern was offline; {differences}");
     let [descriptors, threads] = growth;
     missed(&[
         (
@@ -85,8 +86,11 @@ fn under_faults(seed: u64, count: usize) -> Vec<String> {
         (worst <= 1000, format!("fused again within 1 s of the first message ({returns} times, longest {worst} ms)")),
         (balances, "the ledger balances".into()),
         (left_over.is_empty(), format!("nothing left in shared memory {left_over:?}")),
-        (descriptors.0 <= 8, format!("descriptors flat (at most {:+} in a life, {})", descriptors.0, descriptors.1)),
-        (threads.0 <= 4, format!("threads flat (at most {:+} in a life, {})", threads.0, threads.1)),
+        (
+            descriptors.0 <= 8,
+            format!("descriptors flat (at most {:+} in an instance, {})", descriptors.0, descriptors.1),
+        ),
+        (threads.0 <= 4, format!("threads flat (at most {:+} in an instance, {})", threads.0, threads.1)),
         (stop < Duration::from_secs(5), format!("ended within 5 s ({:.1} s)", stop.as_secs_f64())),
     ])
 }
@@ -110,7 +114,7 @@ fn starts(count: usize, is_secured: bool) -> Vec<String> {
         (slowest < 3000, format!("first fused frame under 3 s after the start (longest {slowest} ms)")),
         (all.iter().all(|start| start.lost_before == 0), "no frame lost before it".into()),
         (stop < Duration::from_secs(5), format!("every stop under 5 s (longest {:.2} s)", stop.as_secs_f64())),
-        (all.iter().all(|start| start.left == 0), "nobody left behind".into()),
+        (all.iter().all(|start| start.left == 0), "no process left behind".into()),
     ])
 }
 

@@ -1,6 +1,6 @@
-//! The long run of damaged inputs: `cargo bench -p tests --bench mutation -- [MESSAGES] [FILES] [SEED]`, by default ten
-//! million messages and a million files of each format; prints a table. With
-//! `-- --seeds FOLDER` it writes the sound inputs down instead, for `fuzz/`.
+//! Long run of damaged inputs: `cargo bench -p tests --bench mutation -- [MESSAGES] [FILES] [SEED]`, by default ten
+//! million messages and a million files of each format; prints a table. With `-- --seeds FOLDER` it writes the valid
+//! inputs instead, for `fuzz/`.
 
 use peak_alloc::PeakAlloc;
 use tests::mutation::run::{files, formats, messages};
@@ -20,9 +20,9 @@ fn main() {
     }
     println!("| format | damaged | accepted | panics | peak memory of one, KiB | seconds |");
     println!("| --- | --- | --- | --- | --- | --- |");
-    let told = (of_messages > 0).then(|| messages(of_messages, seed, &MEMORY));
+    let message_report = (of_messages > 0).then(|| messages(of_messages, seed, &MEMORY));
     let read = (of_files > 0).then(|| files(scratch.path(), of_files, seed, &MEMORY));
-    for report in told.into_iter().chain(read.into_iter().flatten()) {
+    for report in message_report.into_iter().chain(read.into_iter().flatten()) {
         let (kib, seconds) = (report.peak_bytes.div_ceil(1024), report.took.as_secs());
         println!(
             "| {} | {} | {} | {} | {kib} | {seconds} |",
@@ -34,7 +34,7 @@ fn main() {
     }
 }
 
-/// A folder for each format, a file for each sound input.
+/// A folder for each format, a file for each valid input.
 fn write_seeds(folder: &std::path::Path, formats: Vec<(&str, Vec<Vec<u8>>)>) {
     for (name, seeds) in formats {
         let folder = folder.join(name.replace(' ', "_"));

@@ -1,7 +1,8 @@
-//! One ego and ever more neighbours: what each of them costs, how late results are, how many come too late.
+//! Scaling of one ego with the number of neighbours: cost per neighbour, latency of results, share of late feature
+//! maps.
 //!
-//! `ego-fuser run` is the process that is measured. Its neighbours have no networks: each sends the map of one recorded
-//! sweep again and again, 10 times a second, from where it stands on a ring around the ego. Method `max`, one thread.
+//! `ego-fuser run` is the measured process. Its neighbours have no networks: each sends the feature map of one recorded
+//! sweep repeatedly, 10 times a second, from its position on a ring around the ego. Method `max`, one thread.
 //!
 //! ```text
 //! cargo build --release --workspace --bins
@@ -9,9 +10,10 @@
 //! cargo bench -p tests --bench scaling -- --out /tmp/scaling --lattices small --dtype f16 --agents 1,8 --seconds 10
 //! ```
 //!
-//! Lattices: `lean`, that of the shipped weights (64 channels on 128 x 96 cells), and `small`, a quarter of its area with
-//! weights that have learnt nothing. The neighbours, the router and the ego share the machine. Writes `scaling.csv` and
-//! `scaling.md`; the straight line is fitted to the counts at which at least 95 % of all maps were fused in time.
+//! Lattices (BEV grids): `lean`, that of the released weights (64 channels on 128 x 96 cells), and `small`, a quarter
+//! of its area with untrained weights. The neighbours, the router and the ego share the machine. Writes `scaling.csv`
+//! and `scaling.md`; the straight line is fitted to the counts at which at least 95 % of all feature maps were fused in
+//! time.
 
 use std::fmt::Write as _;
 use std::fs;
@@ -41,16 +43,16 @@ use tests::bus::{PATIENCE, TestRouter};
 use tests::machine;
 
 const PERIOD: Duration = Duration::from_millis(100);
-/// How long the ego waits for its neighbours, from the arrival of its own map.
+/// Longest wait of the ego for its neighbours, from the arrival of its own feature map.
 const DEADLINE_MS: u32 = 80;
-/// Ticks before anything is measured.
+/// Ticks before the measurement.
 const WARM_UP: u32 = 20;
-/// From the ego to every neighbour.
+/// Distance from the ego to every neighbour, metres.
 const RING_M: f64 = 15.0;
-/// Share of the maps that has to be fused in time for a count to take part in the fit.
+/// Share of feature maps fused in time from which a count takes part in the fit.
 const IN_TIME: f64 = 0.95;
 
-/// What is asked for.
+/// Options of the benchmark.
 struct Wanted {
     out: PathBuf,
     lattices: Vec<String>,
@@ -87,7 +89,7 @@ fn wanted(arguments: &[String]) -> Result<Wanted> {
         }
     }
     if wanted.out == PathBuf::new() {
-        bail!("--out DIR says where the table goes");
+        bail!("--out DIR is required: the folder of the table");
     }
     Ok(wanted)
 }
@@ -100,7 +102,7 @@ struct Row {
     neighbours: usize,
     frames: usize,
     lost_frames: usize,
-    /// Frames that were decided without all neighbours.
+    /// Number of frames that were decided without all neighbours.
     incomplete: usize,
     in_time: f64,
     cpu_per_frame_ms: f64,
@@ -108,14 +110,14 @@ struct Row {
     latency_p99_ms: f64,
 }
 
-/// A result as the scorer hears it.
-struct Heard {
+/// A result as received by the scorer.
+struct ReceivedResult {
     capture_nanos: u64,
     publish_nanos: u64,
     in_time: usize,
 }
 
-/// The map of a recorded sweep, and weights of the lattice.
+/// The feature map of a recorded sweep, and weights of the BEV grid.
 fn recorded_map(lattice: &str, folder: &Path, dtype: Dtype) -> Result<(PathBuf, EncodedFeatures)> {
     let file = match lattice {
         "lean" => Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy/weights/lean-max.safetensors"),
@@ -128,7 +130,7 @@ fn recorded_map(lattice: &str, folder: &Path, dtype: Dtype) -> Result<(PathBuf, 
             weights::save(&file, &model.variables, &model.about(), weights::Precision::Single)?;
             file
         }
-        _ => bail!("there are two lattices: lean, small"),
+        _ => bail!("lattice must be lean or small"),
     };
     tests::scene::write(folder, &["0"], 1);
     let scenario = dataset::open(&folder.join("scene"))?.scenarios.remove(0);
@@ -153,14 +155,14 @@ fn topic(index: usize, stream: Stream) -> Topic {
     Topic::Stream { cav: cav(index), stream }
 }
 
-/// On the ring; the ego in its middle.
+/// On the ring around the ego.
 fn pose(index: usize, count: usize) -> PoseEstimate {
     let angle = std::f64::consts::TAU * index as f64 / count as f64;
     let place = if index == 0 { [0.0; 3] } else { [RING_M * angle.cos(), RING_M * angle.sin(), 1.9] };
     PoseEstimate::new(Pose { translation_m: place, ..Pose::IDENTITY }, 1.0)
 }
 
-fn measure(file: &Path, map: &EncodedFeatures, count: usize, seconds: u32) -> Result<(Row, Vec<Heard>)> {
+fn measure(file: &Path, map: &EncodedFeatures, count: usize, seconds: u32) -> Result<(Row, Vec<ReceivedResult>)> {
     let router = TestRouter::open();
     let session = open(&BusOptions::client(router.endpoint.clone()))?;
     let joined = |index: usize| {
@@ -204,16 +206,16 @@ fn measure(file: &Path, map: &EncodedFeatures, count: usize, seconds: u32) -> Re
     if !ego.wait()?.success() {
         bail!("the ego failed: see above");
     }
-    let mut heard = Vec::new();
+    let mut received = Vec::new();
     while let Pop::Item(_, Event::Message(arrival)) = inbox.take(Some(Instant::now())) {
         let result: Detections = arrival.decode(&Limits::DEFAULT)?;
         let in_time = result.fused.iter().filter(|fused| fused.age_nanos == 0).count();
         let (capture_nanos, publish_nanos) = (arrival.header.stamp.capture_nanos, arrival.header.stamp.publish_nanos);
         if capture_nanos >= first_nanos {
-            heard.push(Heard { capture_nanos, publish_nanos, in_time });
+            received.push(ReceivedResult { capture_nanos, publish_nanos, in_time });
         }
     }
-    Ok((row(map, count, (ticks - WARM_UP) as usize, cpu_ms, &heard), heard))
+    Ok((row(map, count, (ticks - WARM_UP) as usize, cpu_ms, &received), received))
 }
 
 fn start_ego(router: &TestRouter, weights: &Path) -> Result<Child> {
@@ -223,28 +225,31 @@ fn start_ego(router: &TestRouter, weights: &Path) -> Result<Child> {
     Ok(command.arg("--weights").arg(weights).stdout(Stdio::null()).spawn()?)
 }
 
-fn row(map: &EncodedFeatures, count: usize, ticks: usize, cpu_ms: f64, heard: &[Heard]) -> Row {
-    let latencies: Vec<f64> =
-        heard.iter().map(|heard| heard.publish_nanos.saturating_sub(heard.capture_nanos) as f64 / 1e6).collect();
+fn row(map: &EncodedFeatures, count: usize, ticks: usize, cpu_ms: f64, received: &[ReceivedResult]) -> Row {
+    let latencies: Vec<f64> = received
+        .iter()
+        .map(|received| received.publish_nanos.saturating_sub(received.capture_nanos) as f64 / 1e6)
+        .collect();
     let latencies = statistics::sorted(&latencies);
     let quantile = |q: f64| statistics::quantile(&latencies, q).unwrap_or(f64::NAN);
-    let fused: usize = heard.iter().map(|heard| heard.in_time).sum();
+    let fused: usize = received.iter().map(|received| received.in_time).sum();
     Row {
         lattice: String::new(),
         dtype: Dtype::F32,
         bytes: map.body.as_bytes().len() as u64,
         neighbours: count,
-        frames: heard.len(),
-        lost_frames: ticks - heard.len().min(ticks),
-        incomplete: heard.iter().filter(|heard| heard.in_time < count).count(),
+        frames: received.len(),
+        lost_frames: ticks - received.len().min(ticks),
+        incomplete: received.iter().filter(|received| received.in_time < count).count(),
         in_time: fused as f64 / (ticks * count) as f64,
-        cpu_per_frame_ms: cpu_ms / heard.len().max(1) as f64,
+        cpu_per_frame_ms: cpu_ms / received.len().max(1) as f64,
         latency_p50_ms: quantile(0.5),
         latency_p99_ms: quantile(0.99),
     }
 }
 
-/// Offset and slope of the straight line through the counts that work, and the share of the variance it explains.
+/// Offset and slope of the straight line through the counts that are in time, and the share of the variance it
+/// explains.
 fn line(rows: &[&Row]) -> Option<[f64; 3]> {
     let points: Vec<[f64; 2]> = rows
         .iter()

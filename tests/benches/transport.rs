@@ -1,14 +1,15 @@
-//! `transport/1MiB` and `transport/8MiB`: a feature map from the agent's thread to the ego's, against the same bytes put
-//! by bare zenoh and seen by its callback. They take turns in one run, each over a router on loopback, without shared
-//! memory.
+//! `transport/1MiB` and `transport/8MiB`: a feature map from the agent's thread to the ego's, against the same bytes
+//! put by bare zenoh and received by its callback. They take turns in one run, each over a router on loopback, without
+//! shared memory.
 //!
 //! ```text
 //! cargo bench -p tests --bench transport [-- 8MiB]
 //! ```
 //!
-//! Ours ends when the map is decoded: header, checksum and every value checked, the tensor in aligned memory. Fails
-//! when what arrives is not what was sent, or when ours takes more than 1.2 times as long as zenoh with the settings it
-//! comes with. What the messages cost on top of the bus's own, faster settings is printed beside it.
+//! The bus's time ends when the feature map is decoded: header, checksum and every value checked, the tensor in aligned
+//! memory. Fails when a received map differs from the one sent, or when the bus takes more than 1.2 times as long as
+//! zenoh with its default settings. The cost of the messages on top of the bus's own, faster settings is printed beside
+//! it.
 
 use std::process::ExitCode;
 use std::sync::Arc;
@@ -28,7 +29,7 @@ const ROUNDS: usize = 200;
 const WARM_UP: usize = 20;
 const AT_MOST: f64 = 1.2;
 
-/// A map of `mib` MiB: 64 channels on a square.
+/// A feature map of `mib` MiB: 64 channels on a square.
 fn features(mib: u32) -> BevFeatures {
     let (channels, cells) = (64, mib << 12);
     let width = (f64::from(cells).sqrt() as u32).next_power_of_two();
@@ -37,7 +38,7 @@ fn features(mib: u32) -> BevFeatures {
     BevFeatures { grid, channels, code_of: None, values }
 }
 
-/// Our way.
+/// Through the bus.
 struct Messages {
     publisher: Publisher,
     inbox: Arc<Inbox>,
@@ -73,7 +74,7 @@ impl Messages {
     }
 }
 
-/// zenoh alone.
+/// Through bare zenoh.
 struct Bare {
     publisher: zenoh::pubsub::Publisher<'static>,
     arrivals: Receiver<(Instant, usize)>,
@@ -94,7 +95,7 @@ impl Bare {
         Self { publisher, arrivals, _subscription: subscription }
     }
 
-    /// From before the put to the callback, with bytes that were just made, as a map's are.
+    /// From before the put to the callback, with bytes that were just allocated, as a feature map's are.
     fn time(&self, map: &BevFeatures) -> Duration {
         let bytes = ZBytes::from(Body::Floats(map.values.clone()).as_bytes().to_vec());
         let expected = bytes.len();
@@ -106,12 +107,12 @@ impl Bare {
     }
 }
 
-/// A router and two clients with zenoh's own settings, apart from where they meet and that they do so over TCP alone.
+/// A router and two clients with zenoh's own settings, except for endpoints and the restriction to TCP.
 fn plain_sessions() -> [Session; 3] {
-    let meeting = format!(r#"["tcp/127.0.0.1:{}"]"#, free_port());
+    let endpoint = format!(r#"["tcp/127.0.0.1:{}"]"#, free_port());
     let none = "[]".to_owned();
     ["router", "client", "client"].map(|mode| {
-        let (listen, connect) = if mode == "router" { (&meeting, &none) } else { (&none, &meeting) };
+        let (listen, connect) = if mode == "router" { (&endpoint, &none) } else { (&none, &endpoint) };
         let mut config = Config::default();
         for (key, value) in [
             ("mode", &*format!("{mode:?}")),
@@ -152,7 +153,7 @@ fn measure(mib: u32) -> bool {
     let [[ours, ours_p95], [plain, plain_p95], [bus, bus_p95]] = times.map(|times| summary(&times));
     let ratio = ours / plain;
     println!(
-        "transport/{mib}MiB: ours p50 {ours:.2} ms, p95 {ours_p95:.2} ms; zenoh alone p50 {plain:.2} ms, \
+        "transport/{mib}MiB: ours p50 {ours:.2} ms, p95 {ours_p95:.2} ms; bare zenoh p50 {plain:.2} ms, \
          p95 {plain_p95:.2} ms; ratio of medians {ratio:.2}; \
          zenoh with the bus's settings p50 {bus:.2} ms, p95 {bus_p95:.2} ms, ratio {:.2}",
         ours / bus,

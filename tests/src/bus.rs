@@ -1,4 +1,4 @@
-//! Buses for tests: a router on a free port of this machine and as many clients as a test wants.
+//! Buses for tests: a router on a free port of this machine and any number of clients.
 
 use std::net::TcpListener;
 use std::time::{Duration, Instant};
@@ -7,27 +7,27 @@ use bus::{self, Bus, BusOptions, Endpoint, Event, Identity, Inbox, bounded_queue
 use protocol::{CavId, ProcessId, RunId, Topic};
 use zenoh::Session;
 
-/// Longer than anything here takes, on a machine however busy.
+/// Longer than any step of a test takes, on a machine however busy.
 pub const PATIENCE: Duration = Duration::from_secs(60);
 
-/// A router that the clients of one test meet at.
+/// Router for the clients of one test.
 pub struct TestRouter {
-    /// Where it listens.
+    /// Endpoint at which it listens.
     pub endpoint: Endpoint,
     _session: Session,
 }
 
 impl TestRouter {
-    /// Opens a router on a port that was free a moment ago.
+    /// Opens a router on a port that was free at that moment.
     ///
     /// # Panics
-    /// When there is none.
+    /// When there is no free port.
     #[must_use]
     pub fn open() -> Self {
         // Another process may take the port between the two calls.
         let opened = (0..20).find_map(|_| {
             let endpoint = Endpoint::loopback(free_port());
-            // A machine that stands still for a while must not look like a receiver that is stuck.
+            // A pause of the whole machine must not count as a stalled receiver.
             let options = BusOptions { stall_limit: PATIENCE, ..BusOptions::router(endpoint.clone()) };
             bus::open(&options).ok().map(|session| (endpoint, session))
         });
@@ -37,7 +37,7 @@ impl TestRouter {
 
     /// A client of this router in the run `test`, named `<role>-<cav>` or, for processes without a vehicle, `<cav>`.
     ///
-    /// # Panics
+    /// When it cannot connect.
     /// When it cannot connect.
     #[must_use]
     pub fn join(&self, process: &str, cav: &str) -> Bus {
@@ -76,7 +76,7 @@ pub fn next_event(inbox: &Inbox) -> (Topic, Event) {
 /// Waits until `condition` holds.
 ///
 /// # Panics
-/// When it never does.
+/// When it does not hold in time.
 pub fn wait_for(what: &str, mut condition: impl FnMut() -> bool) {
     let deadline = Instant::now() + PATIENCE;
     while !condition() {

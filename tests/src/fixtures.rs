@@ -1,8 +1,8 @@
 //! Test fixtures: golden archives of the project and sample data outside it.
 //!
-//! Golden archives lie in `tests/golden`, or where `V2V_GOLDEN` points. Sample data may not be passed on: tests that need it
-//! are `#[ignore]`d, and look in `V2V_DATA`, else in `../shared/data` from the project's root. A missing fixture fails the
-//! test with its path. A missing tensor or an unexpected type fails with the names in the message.
+//! Golden archives are in `tests/golden`, or in `V2V_GOLDEN`. Sample data may not be redistributed: tests that need it
+//! are `#[ignore]`d, and read it from `V2V_DATA`, else from `../shared/data` beside the project. A missing fixture
+//! fails the test with its path. A missing tensor or an unexpected type fails with the names in the message.
 //!
 //! ```
 //! let golden = tests::fixtures::golden("c5_poses");
@@ -49,7 +49,7 @@ pub fn data(name: &str) -> PathBuf {
     fixture("V2V_DATA", "../../shared/data", name)
 }
 
-/// `name` in the folder of the environment variable, else in `default` from the manifest's folder.
+/// Path of `name` in the folder of the environment variable, else in `default` from the manifest's folder.
 fn fixture(variable: &str, default: &str, name: &str) -> PathBuf {
     let root =
         std::env::var_os(variable).map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join(default), PathBuf::from);
@@ -74,7 +74,7 @@ impl Golden {
         names
     }
 
-    /// Whether there is a tensor of this name.
+    /// True if there is a tensor of this name.
     #[must_use]
     pub fn has(&self, name: &str) -> bool {
         self.tensors().tensor(name).is_ok()
@@ -143,7 +143,7 @@ pub fn assert_close<T: Into<f64> + Copy>(what: &str, actual: &[T], expected: &[T
     let mut largest = 0.0_f64;
     let mut first_off = None;
     for (index, (difference, allowed, a, b)) in differences.enumerate() {
-        // A NaN is neither below nor above the bound: ask for what is right, not for what is wrong.
+        // A NaN is neither below nor above the bound: the condition is on valid values.
         let close = difference <= allowed;
         if !close && first_off.is_none() {
             first_off = Some((index, a, b));

@@ -1,4 +1,4 @@
-//! Whole fleets as processes: `v2vloc up` on small scenes, with detectors that have learnt nothing.
+//! Fleets as processes: `v2vloc up` on small scenes, with untrained detectors.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -17,7 +17,7 @@ use serde_json::Value;
 
 use crate::locks::random_generator_lock;
 
-/// Longer than anything takes here, under whatever load.
+/// Longer than any step of a test takes, under any load.
 pub const PATIENCE: Duration = Duration::from_secs(120);
 
 /// The folder of the profile that this test was built with, where cargo puts programs.
@@ -42,12 +42,12 @@ pub fn programs() -> &'static Path {
     static BUILT: OnceLock<()> = OnceLock::new();
     let folder = programs_dir();
     BUILT.get_or_init(|| {
-        // `cargo test` builds the programs of other packages only by chance: make sure they are there and fresh.
+        // `cargo test` does not always build the programs of other packages: make sure they exist and are fresh.
         if let Some(cargo) = std::env::var_os("CARGO") {
             let mut build = Command::new(cargo);
             build.args(["build", "--quiet", "--workspace", "--bins"]).current_dir(env!("CARGO_MANIFEST_DIR"));
-            // What cargo tells this test about itself would make a build script of another crate believe that it moved,
-            // and everything above it be compiled anew.
+            // With cargo's variables for this test, a build script of another crate would take itself as moved, and
+            // everything above it would be compiled anew.
             for (name, _) in std::env::vars_os() {
                 let text = name.to_string_lossy();
                 if text == "OUT_DIR" || text.starts_with("CARGO_PKG_") || text.starts_with("CARGO_MANIFEST_") {
@@ -66,16 +66,16 @@ pub fn programs() -> &'static Path {
 /// Writes weights of a small detector with random parameters, the same every time.
 ///
 /// # Panics
-/// When the disk refuses.
+/// When a file cannot be written.
 pub fn write_weights(path: &Path) {
     let model = tiny();
     weights::save(path, &model.variables, &model.about(), weights::Precision::Single).expect("a writable folder");
 }
 
-/// The same with a head that believes in vehicles everywhere: where boxes are compared there have to be some.
+/// The same with a head that detects vehicles everywhere: where boxes are compared there have to be some.
 ///
 /// # Panics
-/// When the disk refuses.
+/// When a file cannot be written.
 pub fn write_sighted_weights(path: &Path) {
     let model = tiny();
     let _ = tch::no_grad(|| model.variables.variables()["cls_head.bias"].shallow_clone().fill_(0.5));
@@ -101,7 +101,7 @@ fn tiny() -> CooperativeModel {
 /// A folder with a scene of two vehicles, weights and a scenario.
 ///
 /// # Panics
-/// When the disk refuses.
+/// When a file cannot be written.
 pub fn write_scenario(folder: &Path, ticks: usize, scene: &str, rest: &str) -> PathBuf {
     crate::scene::write(folder, &["4279", "4288"], ticks);
     write_weights(&folder.join("weights.safetensors"));
@@ -117,7 +117,7 @@ pub fn write_scenario(folder: &Path, ticks: usize, scene: &str, rest: &str) -> P
 pub struct Up {
     child: Child,
     lines: Receiver<String>,
-    said: Vec<String>,
+    output: Vec<String>,
     /// Its run folder.
     pub folder: PathBuf,
 }
@@ -147,20 +147,20 @@ impl Up {
                 let _ = send.send(line);
             }
         });
-        Self { child, lines, said: Vec::new(), folder: runs.join("test") }
+        Self { child, lines, output: Vec::new(), folder: runs.join("test") }
     }
 
-    /// Waits until it says a line that contains `text`, and returns the line.
+    /// Waits for an output line that contains `text`, and returns the line.
     ///
     /// # Panics
-    /// When it does not in time.
+    /// When it does not come in time.
     pub fn wait_for_line(&mut self, text: &str) -> String {
         let deadline = Instant::now() + PATIENCE;
         loop {
             let left = deadline.saturating_duration_since(Instant::now());
             let line =
-                self.lines.recv_timeout(left).unwrap_or_else(|_| panic!("no line with {text:?}: {:?}", self.said));
-            self.said.push(line.clone());
+                self.lines.recv_timeout(left).unwrap_or_else(|_| panic!("no line with {text:?}: {:?}", self.output));
+            self.output.push(line.clone());
             if line.contains(text) {
                 return line;
             }
@@ -170,7 +170,7 @@ impl Up {
     /// Waits until `condition` holds for the results so far, oldest first.
     ///
     /// # Panics
-    /// When it does not in time.
+    /// When it does not hold in time.
     pub fn wait_for_results(&mut self, what: &str, condition: impl Fn(&[Value]) -> bool) {
         let deadline = Instant::now() + PATIENCE;
         loop {
@@ -184,15 +184,15 @@ impl Up {
         }
     }
 
-    /// Process ids of everything it has said to run, last start of each.
+    /// Process ids of all processes that it has reported as running, last start of each.
     #[must_use]
     pub fn pids(&mut self) -> BTreeMap<String, u32> {
-        self.said.extend(self.lines.try_iter());
+        self.output.extend(self.lines.try_iter());
         let started = |line: &String| {
             let (name, rest) = line.split_once(" runs (pid ")?;
             Some((name.to_owned(), rest.trim_end_matches(')').parse().ok()?))
         };
-        self.said.iter().filter_map(started).collect()
+        self.output.iter().filter_map(started).collect()
     }
 
     /// Its own process id.
@@ -204,7 +204,7 @@ impl Up {
     /// Waits until it ends.
     ///
     /// # Panics
-    /// When it does not in time.
+    /// When it does not end in time.
     pub fn wait(&mut self) -> ExitStatus {
         let deadline = Instant::now() + PATIENCE;
         loop {
@@ -224,7 +224,7 @@ impl Drop for Up {
     }
 }
 
-/// The whole lines of a run's `detections.jsonl`.
+/// The complete lines of a run's `detections.jsonl`.
 #[must_use]
 pub fn results(run: &Path) -> Vec<Value> {
     let text = fs::read_to_string(run.join("detections.jsonl")).unwrap_or_default();
@@ -232,7 +232,7 @@ pub fn results(run: &Path) -> Vec<Value> {
     whole.lines().filter_map(|line| serde_json::from_str(line).ok()).collect()
 }
 
-/// How many neighbours a result was fused from.
+/// Number of neighbours that a result was fused from.
 #[must_use]
 pub fn fused(result: &Value) -> usize {
     result["fused"].as_array().map_or(0, Vec::len)
@@ -247,7 +247,7 @@ pub fn signal(pid: u32, name: &str) {
     assert!(status.success(), "kill -{name} {pid}");
 }
 
-/// Whether a process runs; one that is only waited for does not.
+/// True if a process runs; a zombie does not.
 #[must_use]
 pub fn is_running(pid: u32) -> bool {
     let stat = fs::read_to_string(format!("/proc/{pid}/stat")).unwrap_or_default();

@@ -1,23 +1,24 @@
-//! Hosts on one machine: network namespaces around a router's, a cable from it to each.
+//! Hosts on one machine: network namespaces around a router's, a virtual link from it to each.
 
 use std::io;
 use std::net::Ipv4Addr;
 use std::process::{Command, Stdio};
 
-/// Namespaces and cables, gone with this.
+/// Namespaces and virtual links, removed when dropped.
 pub struct Hosts {
     prefix: String,
     names: Vec<&'static str>,
 }
 
 impl Hosts {
-    /// Lays a cable from the host `router` to each of `others`. The first has 10.78.1.1 at the router's end and 10.78.1.2 at
-    /// its own, the second 10.78.2.1 and 10.78.2.2.
+    /// Lays a virtual link from the host `router` to each of `others`. The first has 10.78.1.1 at the router's end and
+    /// 10.78.1.2 at its own, the second 10.78.2.1 and 10.78.2.2.
     ///
     /// # Errors
-    /// The words of `ip` where this is not allowed.
+    /// The error of `ip` where this is not allowed.
     pub fn lay(others: &[&'static str]) -> io::Result<Self> {
-        // Of this process: two tests at once have hosts of their own. Names of interfaces have 15 characters at most.
+        // Names with the id of this process: two tests at once have separate hosts. Names of interfaces have 15
+        // characters at most.
         let prefix = format!("v{}", std::process::id());
         let mut hosts = Self { prefix, names: Vec::new() };
         for name in ["router"].iter().chain(others) {
@@ -50,7 +51,7 @@ impl Hosts {
     }
 }
 
-/// The router's address on the cable to the other host of this index.
+/// The router's address on the virtual link to the other host of this index.
 #[must_use]
 pub fn router_address(index: usize) -> Ipv4Addr {
     Ipv4Addr::new(10, 78, index as u8 + 1, 1)

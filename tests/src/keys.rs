@@ -1,4 +1,4 @@
-//! Routers that ask for keys, and sessions with and without them.
+//! Routers that require keys, and sessions with and without them.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -13,24 +13,24 @@ use crate::bus::free_port;
 /// Keys of an authority of its own, for these processes of a fleet.
 ///
 /// # Panics
-/// When the disk refuses.
+/// When a file cannot be written.
 #[must_use]
-pub fn keys_for(folder: &Path, parties: &[&str]) -> PathBuf {
-    let parties = parties.iter().map(|name| name.parse::<Principal>().expect("a party")).collect();
-    make(&KeyPlan::new(folder, parties, 1)).expect("a writable folder");
+pub fn keys_for(folder: &Path, principals: &[&str]) -> PathBuf {
+    let principals = principals.iter().map(|name| name.parse::<Principal>().expect("a principal")).collect();
+    make(&KeyPlan::new(folder, principals, 1)).expect("a writable folder");
     folder.to_path_buf()
 }
 
-/// Long enough for a connection on loopback, and how long a refused one is tried.
+/// Long enough for a connection on loopback; timeout of a refused one.
 pub const TRIED_FOR: Duration = Duration::from_secs(2);
 
-/// A session over QUIC that shows whatever certificate it likes, or none, without our own checks. It tries once.
+/// A session over QUIC that shows the given certificate or none, without the checks of the bus. It tries once.
 ///
 /// # Errors
-/// zenoh's words, when the router does not take it.
+/// zenoh's error, when the router refuses it.
 ///
 /// # Panics
-/// When zenoh does not know a setting.
+/// When zenoh rejects a setting.
 pub fn stranger(router: &Endpoint, authority: &Path, own: Option<&Path>) -> Result<Session, String> {
     let quoted = |path: &Path| format!("{:?}", path.to_str().unwrap());
     let mut settings = vec![
@@ -51,9 +51,9 @@ pub fn stranger(router: &Endpoint, authority: &Path, own: Option<&Path>) -> Resu
     zenoh::open(config).wait().map_err(|cause| cause.to_string())
 }
 
-/// A router that lets in those with keys of `folder`, each for what is its to do in the run `test`.
+/// A router that admits the holders of keys of `folder`, each restricted to its own topics in the run `test`.
 pub struct GuardedRouter {
-    /// Where it listens.
+    /// Endpoint at which it listens.
     pub endpoint: Endpoint,
     /// Its session.
     pub session: Session,
@@ -80,7 +80,7 @@ impl GuardedRouter {
         Self { endpoint, session, keys: keys.to_path_buf() }
     }
 
-    /// How a client with the keys of `holder` connects.
+    /// Options of a client with the keys of `holder`.
     ///
     /// # Panics
     /// When it has none.
@@ -92,10 +92,10 @@ impl GuardedRouter {
         options
     }
 
-    /// A process of the run `test` with the keys of `holder` that says it is `process`, of vehicle `cav`.
+    /// A process of the run `test` with the keys of `holder` that claims to be `process`, of vehicle `cav`.
     ///
     /// # Errors
-    /// [`BusError`] when the router does not take it.
+    /// [`BusError`] when the router refuses it.
     ///
     /// # Panics
     /// When there are no such keys.
@@ -111,14 +111,14 @@ impl GuardedRouter {
     /// An honest process.
     ///
     /// # Panics
-    /// When the router does not take it.
+    /// When the router refuses it.
     #[must_use]
-    pub fn join(&self, party: &str) -> Bus {
-        let known: Principal = party.parse().expect("a party");
-        self.join_as(party, party, known.cav.as_str()).expect("the router takes those with keys")
+    pub fn join(&self, principal: &str) -> Bus {
+        let known: Principal = principal.parse().expect("a principal");
+        self.join_as(principal, principal, known.cav.as_str()).expect("the router takes those with keys")
     }
 
-    /// How many messages of one kind it has refused to a peer so far.
+    /// Number of messages of one kind that it has refused to a peer so far.
     #[must_use]
     pub fn refused(&self, peer: &str, message: &str) -> u64 {
         let mut refusals = RejectionLog::of(&self.endpoint);

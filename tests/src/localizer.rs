@@ -1,4 +1,4 @@
-//! Small localizers, and such as have learnt nothing, for tests that need files but no meaning.
+//! Small and untrained localizers, for tests that need files but no accuracy.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -27,7 +27,7 @@ pub fn small_encoder() -> SceneEncoderConfig {
 /// Writes an encoder and a head that belong together, with random parameters, the same for the same seed.
 ///
 /// # Panics
-/// When the disk refuses.
+/// When a file cannot be written.
 pub fn write(folder: &Path, seed: i64) -> (PathBuf, PathBuf) {
     let _generator = random_generator_lock();
     tch::manual_seed(seed);
@@ -59,7 +59,7 @@ pub fn write(folder: &Path, seed: i64) -> (PathBuf, PathBuf) {
 /// Writes a network as if it had been trained end to end, with random parameters, the same for the same seed.
 ///
 /// # Panics
-/// When the disk refuses.
+/// When a file cannot be written.
 pub fn write_end_to_end(folder: &Path, regresses: EndToEndKind, seed: i64) -> PathBuf {
     let _generator = random_generator_lock();
     tch::manual_seed(seed);

@@ -1,4 +1,4 @@
-//! Locks between tests: what the machine or the process has only once.
+//! Locks between tests: for resources that the machine or the process has only once.
 
 use std::fs::File;
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -7,7 +7,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 /// several fleets would time each other out, and a measurement of memory counts the whole process.
 ///
 /// # Panics
-/// When the disk refuses.
+/// When a file cannot be written.
 #[must_use]
 pub fn exclusive_lock() -> File {
     let path = crate::fleet::programs_dir().join("exclusive-test.lock");
@@ -16,7 +16,8 @@ pub fn exclusive_lock() -> File {
     file
 }
 
-/// Holds libtorch's random number generator, of which a process has one, until dropped. Tensors are computed on one thread.
+/// Holds libtorch's random number generator, of which a process has one, until dropped. Tensors are computed on one
+/// thread.
 pub fn random_generator_lock() -> MutexGuard<'static, ()> {
     static GENERATOR: Mutex<()> = Mutex::new(());
     tch::set_num_threads(1);

@@ -1,4 +1,4 @@
-//! Small scenes on disk, in the layout of OPV2V, for tests that need files but no meaning.
+//! Small scenes on disk, in the layout of OPV2V, for tests that need files but no realism.
 
 use std::fs;
 use std::path::Path;
@@ -6,14 +6,14 @@ use std::path::Path;
 use dataset::pcd::{Encoding, IntensityField, encode};
 use protocol::PointCloud;
 
-/// Between two ticks in the counter of file names, which counts at 20 Hz: scenes run at 10 Hz.
+/// Step between two ticks in the counter of file names, which counts at 20 Hz: scenes run at 10 Hz.
 const STEM_STEP: usize = 2;
 
 /// Writes `<dir>/scene/<agent>/<stem>.{yaml,pcd}` for every agent and tick: vehicles 15 m apart that drive along x at
 /// 10 m/s over a flat ground, three cars around each.
 ///
 /// # Panics
-/// When the disk refuses.
+/// When a file cannot be written.
 pub fn write(dir: &Path, agents: &[&str], ticks: usize) {
     for (place, agent) in agents.iter().enumerate() {
         let folder = dir.join("scene").join(agent);
@@ -42,7 +42,7 @@ fn yaml(x: f64, y: f64) -> String {
     text
 }
 
-/// Some thousand points: a ground that every vehicle and tick sees a little differently, and the backs of the cars.
+/// Some thousand points: a ground that differs a little per vehicle and tick, and the backs of the cars.
 fn cloud(place: usize, tick: usize) -> PointCloud {
     let shift = 0.01 * (7 * place + tick) as f32;
     let ground = (0..2500).map(move |k| [(k % 50) as f32 - 25.0 + shift, (k / 50) as f32 * 0.8 - 20.0, -1.9, 0.1]);

@@ -1,6 +1,6 @@
-//! Drives on disk as the localization benchmarks keep them: NCLT and Oxford, as LightLoc converts both.
+//! Drives on disk in the layouts of the localization benchmarks: NCLT and Oxford, as LightLoc converts both.
 //!
-//! Points and poses have z down there: what is written is turned half round about x, as the reader turns it back.
+//! Points and poses there have z down: they are written rotated by half a turn about x, which the reader reverts.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -13,7 +13,7 @@ pub const LEFT_OUT: usize = 5;
 /// Time of the first sweep, microseconds.
 const START_MICROS: u64 = 1_547_120_000_000_000;
 
-/// A benchmark's way to keep drives.
+/// Layout of a benchmark.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Benchmark {
     /// Sequences named by the day; points one after another.
@@ -23,7 +23,7 @@ pub enum Benchmark {
 }
 
 impl Benchmark {
-    /// The folder that holds its sequences.
+    /// Folder of its sequences.
     #[must_use]
     pub fn folder(self) -> &'static str {
         match self {
@@ -52,7 +52,7 @@ impl Benchmark {
 /// Writes every drive of the first agent of each scenario below `root`; returns the folder of the sequences.
 ///
 /// # Panics
-/// When a scenario cannot be read or the disk refuses.
+/// When a scenario cannot be read or a file cannot be written.
 pub fn write(root: &Path, benchmark: Benchmark, drives: &[Scenario]) -> PathBuf {
     let folder = root.join(benchmark.folder());
     for (number, drive) in drives.iter().enumerate() {
@@ -65,7 +65,7 @@ pub fn write(root: &Path, benchmark: Benchmark, drives: &[Scenario]) -> PathBuf 
             let micros = START_MICROS + frame.capture_nanos / 1000;
             fs::write(points_dir.join(format!("{micros}.bin")), benchmark.points(&frame.points.xyzi)).expect("a file");
             stamps.push(micros);
-            poses.push(matrix(&frame.world_from_lidar.expect("a generated drive knows its poses").isometry()));
+            poses.push(matrix(&frame.world_from_lidar.expect("a generated drive has its poses").isometry()));
         }
         fs::write(sequence.join("velodyne_left_False.h5"), hdf5(&stamps, &poses)).expect("a file");
     }
@@ -80,8 +80,8 @@ fn matrix(pose: &Isometry3<f64>) -> [f64; 12] {
     std::array::from_fn(|place| matrix[(place / 4, place % 4)])
 }
 
-/// An HDF5 file with the datasets `valid_timestamps` (`n` integers) and `poses` (`n x 12` doubles), the simplest there is:
-/// superblock 0, object headers 1, links in the root's header, data in one piece each.
+/// A minimal HDF5 file with the datasets `valid_timestamps` (`n` integers) and `poses` (`n x 12` doubles): superblock
+/// 0, object headers 1, links in the root's header, data in one piece each.
 pub(crate) fn hdf5(stamps: &[u64], poses: &[[f64; 12]]) -> Vec<u8> {
     // HDF5's descriptions of little-endian 64-bit integers and IEEE doubles.
     const INTEGER: &[u8] = &[0x10, 0x08, 0, 0, 8, 0, 0, 0, 0, 0, 64, 0];
@@ -107,8 +107,8 @@ pub(crate) fn hdf5(stamps: &[u64], poses: &[[f64; 12]]) -> Vec<u8> {
 
     let mut file = b"\x89HDF\r\n\x1a\n".to_vec();
     file.extend([0, 0, 0, 0, 0, 8, 8, 0, 4, 0, 16, 0, 0, 0, 0, 0]);
-    for word in [0, u64::MAX, end as u64, u64::MAX, 0, ROOT_AT as u64, 0, 0, 0] {
-        file.extend(word.to_le_bytes());
+    for value in [0, u64::MAX, end as u64, u64::MAX, 0, ROOT_AT as u64, 0, 0, 0] {
+        file.extend(value.to_le_bytes());
     }
     file.extend(headers(places).concat());
     file.extend(stamps);

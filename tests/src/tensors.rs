@@ -39,7 +39,7 @@ pub fn load(network: &VarStore, golden: &Golden, prefix: &str) {
     }
 }
 
-/// The pillars of each sweep of a case with voxels, and where each pillar of the file went.
+/// The pillars of each sweep of a case with voxels, and the row of each pillar of the file.
 #[must_use]
 pub fn pillars(golden: &Golden) -> (Vec<Pillars>, Vec<usize>) {
     let (shape, features) = golden.f32("in.voxel_features");
@@ -93,7 +93,7 @@ pub fn detector_config(golden: &Golden, backbone: &str) -> DetectorConfig {
 /// An integer of a configuration.
 ///
 /// # Panics
-/// When it is none.
+/// When it is no integer.
 #[must_use]
 pub fn integer(value: &Value) -> i64 {
     value.as_i64().unwrap_or_else(|| panic!("{value} is not an integer"))
@@ -102,7 +102,7 @@ pub fn integer(value: &Value) -> i64 {
 /// A number of a configuration.
 ///
 /// # Panics
-/// When it is none.
+/// When it is no number.
 #[must_use]
 pub fn number(value: &Value) -> f64 {
     value.as_f64().unwrap_or_else(|| panic!("{value} is not a number"))
@@ -111,7 +111,7 @@ pub fn number(value: &Value) -> f64 {
 /// A list of integers of a configuration.
 ///
 /// # Panics
-/// When it is none.
+/// When it is no such list.
 #[must_use]
 pub fn integers(value: &Value) -> Vec<i64> {
     value.as_array().unwrap_or_else(|| panic!("{value} is not a list")).iter().map(integer).collect()

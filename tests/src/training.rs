@@ -1,4 +1,4 @@
-//! Trainings that a test has time for.
+//! Short trainings for tests.
 
 use std::path::Path;
 
@@ -11,14 +11,14 @@ use fusion::Method;
 use perception::model_config::DetectorConfig;
 use perception::train::{Length, RunConfig};
 
-/// Hears what a training says.
+/// Observer of a training.
 #[derive(Default)]
 pub struct Ear {
-    /// Of each step that was reported.
+    /// Loss of each reported step.
     pub losses: Vec<f64>,
-    /// The steps of the validations.
+    /// Steps of the validations.
     pub validations: Vec<u64>,
-    /// Sweeps that were encoded.
+    /// Number of encoded sweeps.
     pub encoded: usize,
 }
 
@@ -34,7 +34,7 @@ impl Observer for Ear {
     }
 }
 
-/// A small network, maps of 16 channels on 44 x 64 cells: a lattice that no window of a transformer divides.
+/// A small network, feature maps of 16 channels on 44 x 64 cells: a BEV grid that no window of a transformer divides.
 pub fn small() -> DetectorConfig {
     DetectorConfig {
         pillar_channels: 8,
@@ -49,7 +49,7 @@ pub fn small() -> DetectorConfig {
     }
 }
 
-/// Some steps of a method, from nothing and without validation.
+/// Some steps of a method, from random weights and without validation.
 pub fn config(data: &Path, out: &Path, method: Method, steps: u64) -> TrainConfig {
     TrainConfig {
         data: vec![data.to_owned()],

@@ -14,7 +14,7 @@ use super::{FONT, FigureError, PAPER};
 
 const INK: RGBColor = RGBColor(40, 44, 52);
 const RULE: RGBColor = RGBColor(226, 229, 234);
-/// Colours of the series, by Okabe and Ito with two greys: told apart with any colour vision.
+/// Colours of the series, by Okabe and Ito with two greys: distinguishable with any colour vision.
 const COLOURS: [RGBColor; 8] = [
     RGBColor(0, 114, 178),
     RGBColor(150, 150, 150),
@@ -31,15 +31,15 @@ const TICKS: usize = 6;
 /// One axis.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Axis {
-    /// What it shows, with its unit.
+    /// Label with its unit.
     pub label: String,
     /// Lower and upper end.
     pub range: [f64; 2],
-    /// Whether equal distances are equal ratios; the range must be above 0 then.
+    /// True if the scale is logarithmic; the range must be above 0 then.
     pub is_logarithmic: bool,
 }
 
-/// How a series is drawn.
+/// Drawing style of a series.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Mark {
     /// Small dots.
@@ -57,20 +57,20 @@ pub struct Series {
     pub name: String,
     /// x and y; a point that is not finite or outside the axes is left out.
     pub points: Vec<(f64, f64)>,
-    /// How it is drawn.
+    /// Drawing style.
     pub mark: Mark,
 }
 
-/// A chart with one x and one y axis.
+/// Chart with one x and one y axis.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Chart {
-    /// Line on top.
+    /// Line above the chart.
     pub title: String,
-    /// To the right.
+    /// Horizontal axis.
     pub x: Axis,
-    /// Up.
+    /// Vertical axis.
     pub y: Axis,
-    /// Later ones are drawn over earlier ones.
+    /// Series; later ones are drawn over earlier ones.
     pub series: Vec<Series>,
 }
 
@@ -78,19 +78,19 @@ type Context<'a, DB> = ChartContext<'a, DB, Cartesian2d<Scale, Scale>>;
 type Drawn<DB> = Result<(), DrawingAreaErrorKind<<DB as DrawingBackend>::ErrorType>>;
 
 impl Axis {
-    /// An axis of equal differences.
+    /// Linear axis.
     #[must_use]
     pub fn linear(label: &str, range: [f64; 2]) -> Self {
         Self { label: label.into(), range, is_logarithmic: false }
     }
 
-    /// An axis of equal ratios.
+    /// Logarithmic axis.
     #[must_use]
     pub fn logarithmic(label: &str, range: [f64; 2]) -> Self {
         Self { label: label.into(), range, is_logarithmic: true }
     }
 
-    /// The range, or one that can be drawn where it is empty or endless.
+    /// The range, or a substitute that can be drawn if it is empty or infinite.
     pub(super) fn drawn_range(&self) -> [f64; 2] {
         let [low, high] = self.range;
         let lowest = if self.is_logarithmic { f64::MIN_POSITIVE } else { f64::MIN };
@@ -98,7 +98,7 @@ impl Axis {
         if can_be_drawn { self.range } else { [0.1, 1.0] }
     }
 
-    /// Place of a value: 0 at the lower end, 1 at the upper.
+    /// Position of a value: 0 at the lower end, 1 at the upper.
     fn share(&self, value: f64) -> f64 {
         let scale = |value: f64| if self.is_logarithmic { value.ln() } else { value };
         let [low, high] = self.drawn_range().map(scale);

@@ -14,21 +14,21 @@ use plotters::style::{FontStyle, RGBColor, register_font};
 pub use chart::{Axis, Chart, Mark, Series};
 pub use raster::{Image, render, save_image};
 
-/// The only font: DejaVu Sans in images; a reader's own font in SVG.
+/// The only font: DejaVu Sans in images; the viewer's own font in SVG.
 pub const FONT: &str = "sans-serif";
 /// Width and height of one chart, pixels.
 const CHART: (u32, u32) = (560, 440);
 const PAPER: RGBColor = RGBColor(255, 255, 255);
 
-/// Why a figure cannot be drawn or written.
+/// Error of drawing or writing a figure.
 #[derive(Debug, thiserror::Error)]
 pub enum FigureError {
     /// The file cannot be written.
     #[error("{}: {source}", path.display())]
     Write {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// The system's reason.
+        /// Error of the operating system.
         source: io::Error,
     },
     /// A shape or a text cannot be drawn.
@@ -75,7 +75,7 @@ fn draw<DB: DrawingBackend>(
     Ok(area.present()?)
 }
 
-/// Hands the font to plotters, which knows none.
+/// Registers the font with plotters, which has none of its own.
 fn load_font() -> Result<(), FigureError> {
     register_font(FONT, FontStyle::Normal, dejavu::sans::regular())
         .map_err(|_| FigureError::Draw("the font is not readable".into()))

@@ -1,6 +1,6 @@
-//! ICP of two sweeps of a street: laying out the target, thinning the source, registering.
+//! ICP of two sweeps of a street: fitting the target's planes, decimating the source, registering.
 //!
-//! `cargo bench -p agent --bench icp`
+//! `cargo bench -p localization --bench icp`
 
 use std::hint::black_box;
 
@@ -19,7 +19,7 @@ fn sweep(world_from_sensor: &Isometry3<f64>, seed: u64) -> Vec<[f32; 4]> {
         let mut within = |from: f64, to: f64| random.random_range(from..to);
         let world = match points.len() % 10 {
             0..=4 => Point3::new(within(-60.0, 60.0), within(-9.0, 9.0), 0.0),
-            // Houses of 14 m stand at different depths: their gables fix the way along the street.
+            // Houses of 14 m stand at different depths: their gables fix the position along the street.
             5..=8 => {
                 let (x, side) = (within(-60.0, 60.0), if points.len() % 2 == 0 { 1.0 } else { -1.0 });
                 let house = (x / 14.0).floor();
@@ -50,7 +50,7 @@ fn icp(criterion: &mut Criterion) {
     let start = truth * Isometry3::new(Vector3::new(0.9, -0.7, 0.1), Vector3::z() * 0.03);
     let planes = IcpTarget::of_sweep(&target, &config);
     let decimate = IcpSource::of_sweep(&source, &config);
-    let fit = register(&decimate, &planes, &start, &config).expect("a street fixes a pose");
+    let fit = register(&decimate, &planes, &start, &config).expect("a street constrains a pose");
     let off = truth.inv_mul(&fit.target_from_source);
     assert!(off.translation.vector.norm() < 0.1, "{off}");
     eprintln!("{} points on {} planes, {} steps", decimate.points_m().len(), planes.planes(), fit.steps);

@@ -1,6 +1,6 @@
 //! Pose solvers side by side: time, and on stderr accuracy over many problems.
 //!
-//! One case: `cargo bench -p agent --bench registration -- town/3000x60`.
+//! One case: `cargo bench -p localization --bench registration -- scene/3000x60`.
 
 use std::hint::black_box;
 use std::time::Instant;
@@ -17,7 +17,7 @@ use rand_distr::{Distribution, StandardNormal};
 /// Problems per row of the table of accuracies.
 const PROBLEMS: u64 = 100;
 
-/// What pairs look like.
+/// Distribution of the pairs of a problem.
 #[derive(Clone, Copy)]
 struct Shape {
     name: &'static str,
@@ -28,37 +28,37 @@ struct Shape {
     /// Half the side of the box that source points lie in, metres.
     reach_m: [f64; 3],
     /// Half the side of the square that targets of outliers lie in, metres.
-    town_m: f64,
+    scene_m: f64,
     /// Inlier threshold, metres.
     threshold_m: f64,
     upright: bool,
 }
 
-/// What a sweep of a vehicle gives: cells that are right to 0.2 to 1.5 m, their weights say roughly which.
-const TOWN: Shape = Shape {
-    name: "town/3000x60",
+/// Cells of a vehicle's sweep: errors of 0.2 to 1.5 m, with weights that follow them roughly.
+const SCENE: Shape = Shape {
+    name: "scene/3000x60",
     count: 3000,
     outliers: 0.6,
     noise_m: [0.2, 1.5],
     reach_m: [60.0, 60.0, 5.0],
-    town_m: 260.0,
+    scene_m: 260.0,
     threshold_m: 1.5,
     upright: true,
 };
 
 const SHAPES: [Shape; 4] = [
-    TOWN,
-    Shape { name: "town/3000x92", outliers: 0.92, ..TOWN },
-    // The sizes that reference solutions of SC2-PCR exist for.
+    SCENE,
+    Shape { name: "scene/3000x92", outliers: 0.92, ..SCENE },
+    // The sizes for which reference solutions of SC2-PCR exist.
     Shape {
         name: "indoor/300x60",
         count: 300,
         noise_m: [0.05, 0.05],
         reach_m: [10.0, 10.0, 10.0],
-        town_m: 20.0,
+        scene_m: 20.0,
         threshold_m: 0.6,
         upright: false,
-        ..TOWN
+        ..SCENE
     },
     Shape {
         name: "indoor/400x85",
@@ -66,7 +66,7 @@ const SHAPES: [Shape; 4] = [
         outliers: 0.85,
         noise_m: [0.03, 0.03],
         reach_m: [10.0, 10.0, 10.0],
-        town_m: 20.0,
+        scene_m: 20.0,
         threshold_m: 0.5,
         upright: false,
     },
@@ -88,7 +88,7 @@ fn problem(shape: &Shape, seed: u64) -> (Isometry3<f64>, Vec<Correspondence>) {
         let log_noise = random.random_range(shape.noise_m[0].ln()..=shape.noise_m[1].ln());
         let target = if random.random_bool(shape.outliers) {
             let mut place = |reach: f64| random.random_range(-reach..reach);
-            Point3::new(place(shape.town_m), place(shape.town_m), place(shape.reach_m[2]))
+            Point3::new(place(shape.scene_m), place(shape.scene_m), place(shape.reach_m[2]))
         } else {
             let mut shaken = truth * source;
             for coordinate in &mut shaken.coords {

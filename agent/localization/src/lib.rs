@@ -1,9 +1,10 @@
 //! Localization of one vehicle from its LiDAR sweep.
 //!
-//! - [`pgc`]: pose generation with confidence, the method of the paper: scene-coordinate regression and a robust solver.
+//! - [`pgc`]: pose generation with confidence, the method of the paper: scene-coordinate regression and a robust
+//!   solver.
 //! - [`competitors`]: networks that the paper compares it with.
 //! - [`registration`]: pose from correspondences (Kabsch, RANSAC, SC2-PCR) and ICP.
-//! - [`pose_source`]: the origins of a vehicle's pose: recorded, noisy, found by one of the above.
+//! - [`pose_source`]: origins of a vehicle's pose: recorded, noisy, estimated by one of the above.
 //! - [`pose_error`], [`statistics`]: measures of their accuracy.
 
 #![warn(clippy::print_stdout, clippy::print_stderr)]

@@ -1,8 +1,8 @@
-//! How far a pose is from the true one.
+//! Error of a pose: distance and angle to the true one.
 
 use protocol::Pose;
 
-/// The error of one pose.
+/// Error of one pose.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PoseError {
     /// Distance to the true position, metres.
@@ -12,7 +12,7 @@ pub struct PoseError {
 }
 
 impl PoseError {
-    /// How far `found` is from `truth`; both are poses in the same world.
+    /// Error of `found` against `truth`; both are poses in the same world.
     #[must_use]
     pub fn between(found: &Pose, truth: &Pose) -> Self {
         let difference = truth.isometry().inv_mul(&found.isometry());

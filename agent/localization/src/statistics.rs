@@ -2,8 +2,8 @@
 
 use support::statistics::mean;
 
-/// Spearman's rank correlation of paired samples, equal values sharing their mean rank; `None` when one of them does not
-/// vary, or there are fewer than two pairs.
+/// Spearman's rank correlation of paired samples, equal values sharing their mean rank; `None` when one of them does
+/// not vary, or there are fewer than two pairs.
 #[must_use]
 pub fn spearman(a: &[f64], b: &[f64]) -> Option<f64> {
     pearson(&ranks(a), &ranks(b))
@@ -56,7 +56,7 @@ mod tests {
     }
 
     #[test]
-    fn what_does_not_vary_has_no_correlation() {
+    fn constant_samples_have_no_correlation() {
         assert_eq!(spearman(&[1.0, 1.0], &[1.0, 2.0]), None);
         assert_eq!(spearman(&[1.0], &[1.0]), None);
     }

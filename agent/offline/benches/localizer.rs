@@ -1,7 +1,8 @@
-//! What a sweep costs before its pose is known, stage by stage, on one thread.
+//! Latency of localization, stage by stage, on one thread.
 //!
-//! `cargo bench -p agent --bench localizer`, or with a filter, for example `-- lean/encode`. The sweep is generated, the
-//! weights are random: neither changes what has to be computed. The solver has a bench of its own (`registration`).
+//! `cargo bench -p agent-offline --bench localizer`, or with a filter, for example `-- lean/encode`. The sweep is
+//! generated and the weights are random: neither changes the amount of computation. The solver has a bench of its own
+//! (`registration`).
 
 use std::hint::black_box;
 

@@ -1,4 +1,4 @@
-//! Subcommands of the agent that read data sets.
+//! Command line of the agent's offline subcommands, which read data sets.
 
 use std::process::ExitCode;
 
@@ -29,9 +29,9 @@ enum Command {
     Train(command::train::Args),
 }
 
-/// RunScope a subcommand.
+/// Runs a subcommand.
 pub(crate) fn run(cli: Cli) -> ExitCode {
-    let kept = malloc_settings::ensure(&malloc_settings::KEPT_MEMORY).context("this program again");
+    let kept = malloc_settings::ensure(&malloc_settings::KEPT_MEMORY).context("cannot execute this program again");
     let outcome = kept.and_then(|()| match cli.command {
         Command::Eval(args) => command::eval::run(&args),
         Command::Localize(args) => command::localize::run(&args),

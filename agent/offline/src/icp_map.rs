@@ -1,7 +1,7 @@
-//! A pose from a map of points: the sweep is registered against everything that earlier drives have seen.
+//! ICP against a point-cloud map: registers the sweep against the accumulated sweeps of earlier drives.
 //!
-//! What pose generators are compared with: exact where it starts near enough, but the map has to be carried along and a
-//! receiver has to say where to begin.
+//! The baseline of pose generators: accurate if the start is near enough, but the point-cloud map has to be stored in
+//! the vehicle and a receiver has to give the start.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -13,7 +13,7 @@ use protocol::{NoPoseReason, PoseEstimate};
 use localization::pose_source::{NO_SOURCE, PoseInput, PoseSource};
 use localization::registration::icp::{self, IcpConfig, IcpSource, IcpTarget, NoIcpFit};
 
-/// Registers every sweep against a map, beginning at the measured pose.
+/// Registers every sweep against a point-cloud map, starting at the measured pose.
 #[derive(Debug, Clone)]
 pub struct IcpMapPose {
     map: Arc<IcpTarget>,
@@ -21,7 +21,7 @@ pub struct IcpMapPose {
 }
 
 impl IcpMapPose {
-    /// Takes a map that was made with the same settings.
+    /// Source with a point-cloud map that was built with the same settings.
     #[must_use]
     pub fn new(map: Arc<IcpTarget>, config: IcpConfig) -> Self {
         Self { map, config }
@@ -29,7 +29,7 @@ impl IcpMapPose {
 }
 
 impl PoseSource for IcpMapPose {
-    /// The confidence is the share of points that found their place.
+    /// The confidence is the share of points with a partner.
     fn estimate(&mut self, input: &PoseInput<'_>) -> PoseEstimate {
         let Some(start) = input.measured else { return NO_SOURCE };
         let source = IcpSource::of_sweep(&input.cloud.xyzi, &self.config);
@@ -47,7 +47,7 @@ fn no_pose(reason: NoPoseReason) -> PoseEstimate {
     PoseEstimate::NoPose { reason, inlier_count: 0 }
 }
 
-/// Why there is no map.
+/// Error of building a point-cloud map.
 #[derive(Debug, thiserror::Error)]
 pub enum MapError {
     /// A scene is not readable.
@@ -58,7 +58,7 @@ pub enum MapError {
     NoPoses(PathBuf),
 }
 
-/// Makes a map of drives with true poses: of every agent a sweep each `spacing_m` metres of way.
+/// Builds a point-cloud map of drives with true poses: of every agent a sweep per `spacing_m` metres of path.
 ///
 /// # Errors
 /// [`MapError`] names the file.
@@ -97,7 +97,7 @@ mod tests {
 
     use super::*;
 
-    /// Ground and two pairs of walls around the origin, as seen from there.
+    /// Ground and two pairs of walls around the origin, as measured from there.
     fn yard() -> PointCloud {
         let ground = (0..6400).map(|k| [(k % 80) as f32 * 0.5 - 20.0, (k / 80) as f32 * 0.5 - 20.0, -2.0, 0.1]);
         let wall = (0..4000).map(|k| {
@@ -108,7 +108,7 @@ mod tests {
     }
 
     #[test]
-    fn a_vehicle_is_put_where_the_map_says() {
+    fn a_vehicle_is_localized_on_the_point_cloud_map() {
         let config = IcpConfig::default();
         let truth = Pose::from_xyz_yaw([1200.0, -340.0, 20.0], 0.8);
         let mut map = IcpTarget::new(&config);

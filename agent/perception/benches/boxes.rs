@@ -1,4 +1,4 @@
-//! Boxes: rotated suppression and decoding. One case: `cargo bench -p agent --bench boxes -- nms/clusters/1000`.
+//! Boxes: rotated suppression and decoding. One case: `cargo bench -p perception --bench boxes -- nms/clusters/1000`.
 
 use std::hint::black_box;
 
@@ -13,7 +13,7 @@ use protocol::rotated_iou::Polygon;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-/// `count` boxes around `vehicles` places, as a head leaves them: many near-copies of each vehicle.
+/// `count` boxes around `vehicles` positions, like the output of a head: many near-copies of each vehicle.
 fn boxes(count: usize, vehicles: usize, seed: u64) -> (Vec<Polygon>, Vec<f32>) {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     let places: Vec<[f64; 3]> = (0..vehicles)

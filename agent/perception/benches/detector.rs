@@ -1,4 +1,4 @@
-//! Pillars and the encoder, per sweep. One case: `cargo bench -p agent --bench detector -- voxelise/full/60000`.
+//! Pillars and encoder, per sweep. One case: `cargo bench -p perception --bench detector -- voxelise/full/60000`.
 //!
 //! The encoders run on one torch thread, `full` also on two, the setting of the reference's figure of 0.72 s.
 
@@ -16,14 +16,14 @@ use support::statistics;
 use tch::Device;
 use tch::nn::VarStore;
 
-/// A sweep like a turning LiDAR's on a street: rings on the ground, walls and cars above it, `count` points.
+/// A sweep like that of a rotating LiDAR on a street: rings on the ground, walls and cars above it, `count` points.
 fn sweep(count: usize, reach_m: f32) -> Vec<[f32; 4]> {
     let rings = 64;
     (0..count)
         .map(|index| {
             let (ring, step) = (index % rings, index / rings);
             let azimuth = step as f32 / (count / rings) as f32 * TAU;
-            // Elevations from -25 degrees on: low rings meet the ground, the upper ones walls at a changing distance.
+            // Elevations from -25 degrees on: low rings hit the ground, the upper ones walls at a varying distance.
             let slope = (-25.0 + 27.0 * ring as f32 / rings as f32).to_radians().tan();
             let ground = 1.9 / (-slope).max(0.01);
             let wall = 9.0 + 30.0 * (3.0 * azimuth).sin().abs() + 4.0 * (17.0 * azimuth).sin();

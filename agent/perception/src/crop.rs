@@ -1,15 +1,15 @@
-//! Which points of a sweep the detector looks at.
+//! Crop: selects the points of a sweep that enter the detector.
 
 use protocol::PointCloud;
 
 use crate::model_config::DetectorConfig;
 
-/// Keeps the points inside the detector's area and outside the own body.
+/// Keeps the points inside the detector's area and outside the vehicle's own body.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Crop {
     low_m: [f32; 3],
     high_m: [f32; 3],
-    /// x, y of the lower, then of the upper corner.
+    /// x, y of the lower, then of the upper corner, metres.
     own_body_m: Option<[f32; 4]>,
 }
 
@@ -26,13 +26,13 @@ impl Crop {
 
     /// Appends the points to keep to `kept`, in their order.
     ///
-    /// The area is open: a point on its edge goes, as in the reference. Points that are not finite go.
+    /// The area is open: a point on its edge is removed, as in the reference. Points that are not finite are removed.
     pub fn keep(&self, points: &[[f32; 4]], kept: &mut Vec<[f32; 4]>) {
         kept.extend(points.iter().filter(|point| self.is_kept(point)));
     }
 
-    /// The sweep without the points on the vehicle's own body, at any distance: what goes to others for early fusion.
-    /// Points that are not finite go as well.
+    /// The sweep without the points on the vehicle's own body, at any distance: the input of early fusion at other
+    /// vehicles. Points that are not finite are removed as well.
     #[must_use]
     pub fn without_own_body(&self, cloud: &PointCloud) -> PointCloud {
         let anywhere = Self { low_m: [f32::NEG_INFINITY; 3], high_m: [f32::INFINITY; 3], ..*self };
@@ -60,7 +60,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn own_body_edges_and_odd_numbers_go() {
+    fn own_body_edges_and_non_finite_points_are_removed() {
         let crop = Crop::for_detector(&DetectorConfig::lean());
         let keep = [5.0, 0.0, -1.0, 0.5];
         let drop = [

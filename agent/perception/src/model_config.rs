@@ -1,21 +1,22 @@
-//! The numbers that define a detector: area, pillars, backbone, head.
+//! Configuration of a detector: area, pillars, backbone, head.
 
 use protocol::BevGrid;
 use serde::{Deserialize, Serialize};
 
-use crate::layers::head::BOX_CODE;
+/// Number of values that describe a box relative to its anchor: x, y, z, h, w, l, yaw.
+pub const BOX_CODE: i64 = 7;
 
-/// Why a [`DetectorConfig`] cannot be built.
+/// Reason why a [`DetectorConfig`] is invalid.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum ConfigError {
-    /// The area, the pillar size or a count is empty, negative or not a number.
+    /// The area, the pillar size or a count is empty, negative or NaN.
     #[error("detector configuration: {field} is {value}, must be {must}")]
     Value {
         /// Name of the field.
         field: &'static str,
-        /// What stood there.
+        /// Value of the field.
         value: String,
-        /// What would be right.
+        /// Condition on the value.
         must: &'static str,
     },
     /// Lists that describe the same levels differ in length.
@@ -23,14 +24,14 @@ pub enum ConfigError {
     Levels {
         /// Name of the field.
         field: &'static str,
-        /// Its length.
+        /// Number of its entries.
         got: usize,
         /// Number of levels.
         levels: usize,
     },
 }
 
-/// How the concatenated backbone levels become the map that crosses the air.
+/// Reduction of the concatenated backbone levels to the transmitted feature map.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "snake_case", deny_unknown_fields)]
 pub enum ShrinkConfig {
@@ -48,7 +49,7 @@ pub enum ShrinkConfig {
     },
 }
 
-/// What the blocks of the backbone are made of.
+/// Kind of the backbone's blocks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum BlockKind {
@@ -59,23 +60,24 @@ pub enum BlockKind {
     Residual,
 }
 
-/// Towards which side y grows in the world that a network was trained in.
+/// Side towards which y grows in the frame that a network was trained in.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum YAxis {
     /// Left, as everywhere in this program.
     #[default]
     Left,
-    /// Right, as in CARLA and the public reference codes: weights from there see a mirrored world. Clouds are mirrored
-    /// before such a network and boxes behind it; its maps lie mirrored on the air, among others of the same network.
+    /// Right, as in CARLA and the public reference codes: weights from there belong to a mirrored frame. Clouds are
+    /// mirrored before such a network and boxes behind it; its feature maps are transmitted mirrored, for others of the
+    /// same network.
     Right,
 }
 
-/// The prior boxes at every cell of the head.
+/// Prior boxes at every cell of the head.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct AnchorConfig {
-    /// Length, width, height in metres.
+    /// Length, width and height, metres.
     pub size_lwh_m: [f64; 3],
     /// Height of the centre above the LiDAR, metres.
     pub center_z_m: f64,
@@ -89,52 +91,52 @@ impl Default for AnchorConfig {
     }
 }
 
-/// A PointPillars detector, from the area it looks at to its head.
+/// Configuration of a PointPillars detector, from its area to its head.
 ///
-/// It is stored as JSON in the metadata of a weights file, so that a file is complete alone.
+/// It is stored as JSON in the metadata of a weights file, so that the file is self-contained.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DetectorConfig {
-    /// Name of the configuration, for reports.
+    /// Name of the configuration, in reports.
     pub name: String,
     /// x, y, z of the lower corner, then of the upper, metres in the LiDAR frame.
     pub lidar_range_m: [f64; 6],
     /// Edges of a pillar along x, y, z, metres.
     pub voxel_size_m: [f64; 3],
-    /// Points a pillar keeps at most; the first ones win.
+    /// Largest number of points of a pillar; the first ones are kept.
     pub max_points_per_pillar: usize,
-    /// Pillars a sweep has at most; the first ones win.
+    /// Largest number of pillars of a sweep; the first ones are kept.
     pub max_pillars: usize,
     /// Channels of the pillar encoder.
     pub pillar_channels: i64,
-    /// What blocks are made of.
+    /// Kind of the blocks.
     #[serde(default)]
     pub blocks: BlockKind,
-    /// Towards which side its world grows; a network that is mirrored has an area as wide to the left as to the right.
+    /// Side towards which y grows; a mirrored network has an area as wide to the left as to the right.
     #[serde(default)]
     pub y_axis: YAxis,
-    /// Layers of each block after its strided one; of residual ones: their number.
+    /// Layers of each block after its strided one; for residual blocks: their number.
     pub layer_nums: Vec<usize>,
     /// Stride of each block.
     pub layer_strides: Vec<i64>,
     /// Channels of each block.
     pub num_filters: Vec<i64>,
-    /// Up-sampling of each block on its way to the concatenation.
+    /// Up-sampling factor of each block before the concatenation.
     pub upsample_strides: Vec<i64>,
     /// Channels of each up-sampled block.
     pub num_upsample_filters: Vec<i64>,
-    /// Reduction of the concatenated map; absent: it crosses the air as it is.
+    /// Reduction of the concatenated map; absent: it is transmitted as it is.
     pub shrink: Option<ShrinkConfig>,
-    /// The learnt channel compressor transmits one channel in so many; absent: none.
+    /// Ratio of channels to transmitted channels of the learnt compressor; absent: none.
     pub compress_ratio: Option<i64>,
     /// Anchors of the head.
     pub anchors: AnchorConfig,
-    /// Points of the carrier itself: x and y of the lower, then of the upper corner of a box that is cut out, metres.
+    /// Box of the vehicle's own body that is cut out: x and y of the lower, then of the upper corner, metres.
     pub own_body_m: Option<[f64; 4]>,
 }
 
 impl DetectorConfig {
-    /// OpenCOOD's numbers: x +-140.8 m, y +-38.4 m, a 256 x 48 x 176 map at 1.6 m.
+    /// OpenCOOD's configuration: x +-140.8 m, y +-38.4 m, a 256 x 48 x 176 feature map at 1.6 m.
     #[must_use]
     pub fn full() -> Self {
         Self {
@@ -158,7 +160,7 @@ impl DetectorConfig {
         }
     }
 
-    /// Sized for two cores and live traffic: x +-51.2 m, y +-38.4 m, a 64 x 96 x 128 map at 0.8 m.
+    /// For two cores and live traffic: x +-51.2 m, y +-38.4 m, a 64 x 96 x 128 feature map at 0.8 m.
     #[must_use]
     pub fn lean() -> Self {
         Self {
@@ -193,7 +195,7 @@ impl DetectorConfig {
         })
     }
 
-    /// Pillars per cell of the map that crosses the air, along one axis.
+    /// Pillars per cell of the transmitted feature map, along one axis.
     #[must_use]
     pub fn feature_stride(&self) -> i64 {
         let shrink = match self.shrink {
@@ -210,7 +212,7 @@ impl DetectorConfig {
         self.num_upsample_filters.iter().sum()
     }
 
-    /// Channels of the map that is fused and of the head's input.
+    /// Channels of the fused feature map and of the head's input.
     #[must_use]
     pub fn feature_channels(&self) -> i64 {
         match self.shrink {
@@ -219,13 +221,13 @@ impl DetectorConfig {
         }
     }
 
-    /// Channels of the map that is transmitted: of the code, where there is a compressor.
+    /// Channels of the transmitted feature map: of the code, if there is a compressor.
     #[must_use]
     pub fn sent_channels(&self) -> i64 {
         self.compress_ratio.map_or(self.feature_channels(), |ratio| (self.feature_channels() / ratio).max(1))
     }
 
-    /// The lattice of the map that crosses the air.
+    /// BEV grid of the transmitted feature map.
     #[must_use]
     pub fn feature_grid(&self) -> BevGrid {
         let [width, height, _] = self.pillar_grid().map(|count| u32::try_from(count).unwrap_or(u32::MAX));
@@ -239,7 +241,7 @@ impl DetectorConfig {
         pillars.downsampled(u32::try_from(self.feature_stride()).unwrap_or(1).max(1))
     }
 
-    /// Checks that a network can be built and that the levels meet on one lattice.
+    /// Checks that a network can be built and that all levels have one BEV grid.
     ///
     /// # Errors
     /// [`ConfigError`] names the field, its value and what it must be.
@@ -267,7 +269,7 @@ impl DetectorConfig {
         self.check_sizes()
     }
 
-    /// Checked before anything of such a size is allocated: the file that the numbers come from may be anybody's.
+    /// Checked before anything of this size is allocated: the file with these numbers may come from anyone.
     fn check_sizes(&self) -> Result<(), ConfigError> {
         let [x, y, _] = self.pillar_grid().map(|count| count as i64);
         let canvas = x * y * self.pillar_channels;
@@ -279,7 +281,8 @@ impl DetectorConfig {
         let widest = self.num_filters.iter().chain(&layers).copied().max().unwrap_or(0);
         let map = (x / step) * (y / step) * widest;
         if map > MAX_VALUES {
-            let field = "cells of a map times the most of num_filters, num_upsample_filters, shrink and anchors";
+            let field =
+                "cells of a feature map times the largest of num_filters, num_upsample_filters, shrink and anchors";
             return Err(value_error(field, map, "268435456 values at most"));
         }
         let parameters = self.parameters();
@@ -330,11 +333,7 @@ impl DetectorConfig {
             return Err(value_error("voxel_size_m", self.voxel_size_m, "equal along x and y"));
         }
         if self.y_axis == YAxis::Right && (range[1] + range[4]).abs() > 1e-9 {
-            return Err(value_error(
-                "lidar_range_m",
-                range,
-                "as wide to the left as to the right where y_axis is right",
-            ));
+            return Err(value_error("lidar_range_m", range, "as wide to the left as to the right if y_axis is right"));
         }
         let [x, y, z] = self.pillar_grid();
         if z != 1 {
@@ -372,13 +371,17 @@ impl DetectorConfig {
         self.check_strides()
     }
 
-    /// Every level must come back to the same lattice, without a rest.
+    /// Every level must be up-sampled to the same BEV grid, without a remainder.
     fn check_strides(&self) -> Result<(), ConfigError> {
         let mut down = 1;
         for (stride, up) in self.layer_strides.iter().zip(&self.upsample_strides) {
             down *= stride;
             if down % up != 0 || down / up != self.layer_strides[0] / self.upsample_strides[0] {
-                return Err(value_error("upsample_strides", &self.upsample_strides, "bring all levels to one lattice"));
+                return Err(value_error(
+                    "upsample_strides",
+                    &self.upsample_strides,
+                    "bring all levels to one BEV grid",
+                ));
             }
         }
         let [x, y, _] = self.pillar_grid();
@@ -390,14 +393,14 @@ impl DetectorConfig {
     }
 }
 
-/// The box that the LiDAR's own car fills, as OpenCOOD cuts it out: x and y of the lower and the upper corner, metres.
+/// Box of the car under the LiDAR, as in OpenCOOD: x and y of the lower and the upper corner, metres.
 pub const OWN_BODY_M: [f64; 4] = [-1.95, -1.1, 2.95, 1.1];
 
-/// More cells than any map in the field has; keeps a wrong number from taking all memory.
+/// Largest number of cells, more than any map in use has; bounds the memory that a wrong number can take.
 const MAX_CELLS: usize = 1 << 24;
-/// Values of a map, for the same reason: 1 GiB.
+/// Largest number of values of a map, for the same reason: 1 GiB.
 const MAX_VALUES: i64 = 1 << 28;
-/// Parameters of a network, for the same reason: nearly 1 GiB.
+/// Largest number of parameters of a network, for the same reason: nearly 1 GiB.
 const MAX_PARAMETERS: i64 = 256_000_000;
 
 fn value_error(field: &'static str, value: impl std::fmt::Debug, must: &'static str) -> ConfigError {
@@ -409,7 +412,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn presets_have_the_maps_they_promise() {
+    fn presets_have_the_documented_maps() {
         let full = DetectorConfig::full();
         full.validate().unwrap();
         let grid = full.feature_grid();
@@ -421,11 +424,11 @@ mod tests {
         assert_eq!((lean.pillar_grid(), lean.sent_channels()), ([256, 192, 1], 64));
         let squeezed = |ratio| DetectorConfig { compress_ratio: Some(ratio), ..DetectorConfig::lean() };
         assert_eq!([1, 32, 100].map(|ratio| squeezed(ratio).sent_channels()), [64, 2, 1]);
-        assert_eq!(squeezed(32).feature_channels(), 64, "behind the air the map is whole again");
+        assert_eq!(squeezed(32).feature_channels(), 64, "the receiver has the full number of channels");
     }
 
     #[test]
-    fn json_round_trip_keeps_everything_and_refuses_misspelt_fields() {
+    fn json_round_trip_keeps_everything_and_rejects_misspelt_fields() {
         let full = DetectorConfig::full();
         let mut json = serde_json::to_value(&full).unwrap();
         assert_eq!(serde_json::from_value::<DetectorConfig>(json.clone()).unwrap(), full);
@@ -434,7 +437,7 @@ mod tests {
     }
 
     #[test]
-    fn what_does_not_fit_into_memory_is_refused_before_it_is_asked_for() {
+    fn sizes_beyond_memory_are_rejected_before_allocation() {
         let refused = |config: DetectorConfig, field: &str, value: &str| {
             let message = config.validate().unwrap_err().to_string();
             assert!(message.contains(field) && message.contains(value), "{message}");
@@ -457,7 +460,7 @@ mod tests {
     }
 
     #[test]
-    fn refuses_levels_that_do_not_meet() {
+    fn rejects_levels_of_different_grids() {
         let mut config = DetectorConfig::lean();
         config.upsample_strides = vec![1, 2, 2];
         let message = config.validate().unwrap_err().to_string();

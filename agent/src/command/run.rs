@@ -13,7 +13,7 @@ use support::output;
 
 use support::cli::BadInput;
 
-/// Run one vehicle: its sensors in; pose, feature map, boxes or points out.
+/// Run one vehicle: subscribes to its sensors; publishes pose, feature map, boxes or points.
 ///
 /// Ends when the replay does, or on Ctrl-C or SIGTERM.
 #[derive(Debug, clap::Args)]

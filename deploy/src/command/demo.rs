@@ -5,8 +5,8 @@ use std::time::Instant;
 
 use anyhow::Context;
 use deploy::experiment::report;
-use deploy::operate::run_fleet::{RunResult, UpOptions, up};
 use deploy::operate::run_folder::name_of_now;
+use deploy::run::run_fleet::{RunResult, UpOptions, up};
 use deploy::scenario::Scenario;
 use fusion::Method;
 use protocol::RunId;
@@ -28,7 +28,7 @@ pub(crate) struct Arguments {
     /// The scenario to run on the generated scene.
     #[arg(long, default_value = SCENARIO, hide_default_value = true)]
     scenario: PathBuf,
-    /// Folder of the generated scenes; one that is there already is used again.
+    /// Folder of the generated scenes; an existing scene is used again.
     #[arg(long, default_value = "scenes")]
     scenes: PathBuf,
     /// Folder of the run folders.
@@ -55,7 +55,7 @@ pub(crate) struct Arguments {
 }
 
 impl Arguments {
-    /// Generates, runs, prints.
+    /// Generates the scene, runs the methods and prints their metrics.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
         let mut scenario = Scenario::read(&self.scenario)?;
         scenario.scene.dir = self.scene()?;
@@ -77,7 +77,7 @@ impl Arguments {
         Ok(Outcome::of(results.iter().any(RunResult::lost_data)))
     }
 
-    /// The scene's folder, generated if it is not there.
+    /// Folder of the scene, which is generated if it does not exist.
     fn scene(&self) -> anyhow::Result<PathBuf> {
         let scenes = std::path::absolute(&self.scenes)?;
         let name = format!("v2vdet-{}-{}x{}", self.seed, self.agents, self.frames);

@@ -30,20 +30,20 @@ use support::cli::Outcome;
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct Arguments {
-    /// Data set, split or scenario; the layout is found out. The first vehicle of each scenario is the ego.
+    /// Data set, split or scenario; its layout is detected. The first vehicle of each scenario is the ego.
     #[arg(long, value_name = "DIR", required_unless_present = "table")]
     dataset: Option<PathBuf>,
     /// Fusion methods, as `ego-fuser methods` lists them; several give one table.
     #[arg(long, value_name = "NAME", value_delimiter = ',', required_unless_present = "table")]
     method: Vec<Method>,
-    /// Weights of the detector; or a folder with *-METHOD.safetensors or METHOD/weights.safetensors for each method; or the
-    /// folder of a training.
+    /// Weights of the detector; or a folder with *-METHOD.safetensors or METHOD/weights.safetensors for each method; or
+    /// the folder of a training.
     #[arg(long, value_name = "FILE", required_unless_present = "table")]
     weights: Option<PathBuf>,
     /// Instead: a file of tables, rows of methods and columns of conditions; cells that are done are kept in --out.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["dataset", "method", "weights"], requires = "out")]
     table: Option<PathBuf>,
-    /// Where tables are written (--table).
+    /// Folder of the tables (--table).
     #[arg(long, value_name = "DIR", requires = "table")]
     out: Option<PathBuf>,
     #[command(flatten, next_help_heading = "Pose")]
@@ -52,10 +52,10 @@ pub(crate) struct Arguments {
     codec: Section<CodecConfig>,
     #[command(flatten)]
     rate: Section<RateConfig>,
-    /// How long messages of neighbours are under way, milliseconds.
+    /// Delay of the messages of neighbours, milliseconds.
     #[arg(long, value_name = "MS", default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=10_000))]
     delay: u64,
-    /// The emulated air between neighbours and ego, in virtual time: a preset of `sim-replay link`, or a file.
+    /// Link emulation between neighbours and ego, in simulation time: a preset of `sim-replay link`, or a file.
     #[arg(long, value_name = "PRESET|FILE", conflicts_with = "delay")]
     link: Option<String>,
     /// Same seed, same losses and delays (--link).
@@ -64,37 +64,39 @@ pub(crate) struct Arguments {
     /// Longest time that a frame waits for its neighbours, milliseconds (--link) [default: that of ego-fuser run].
     #[arg(long, value_name = "MS", requires = "link")]
     deadline_ms: Option<u64>,
-    /// Largest age of a map that is still fused, by capture time, milliseconds (--link) [default: that of ego-fuser run].
+    /// Largest age of a feature map that is still fused, by capture time, milliseconds (--link) [default: that of
+    /// ego-fuser run].
     #[arg(long, value_name = "MS", requires = "link")]
     max_age_ms: Option<u64>,
-    /// Compute time of pose, map and fusion, milliseconds, for example 20,60,30; without it no latency is told (--link).
+    /// Compute time of pose, map and fusion, milliseconds, for example 20,60,30; without it no latency is reported
+    /// (--link).
     #[arg(long, value_name = "MS,MS,MS", value_delimiter = ',', num_args = 1, default_values_t = [0.0; 3], requires = "link")]
     compute: Vec<f64>,
-    /// Lets neighbours lie: to see what that does to the ego.
-    #[arg(long, value_enum, value_name = "LIE")]
+    /// Attack by neighbours: falsified messages, to measure their effect on the ego.
+    #[arg(long, value_enum, value_name = "ATTACK")]
     attack: Option<Falsification>,
-    /// How many of them lie, the first of every scenario (--attack).
+    /// Number of attackers, the first neighbours of every scenario (--attack).
     #[arg(long, default_value_t = 1, requires = "attack")]
     liars: usize,
-    /// Same seed, same lies (--attack).
+    /// Seed of the falsified messages (--attack).
     #[arg(long, default_value_t = 0, requires = "attack")]
     attack_seed: u64,
-    /// Leaves out neighbours whose words do not fit what the ego sees itself.
+    /// Misbehaviour detection: excludes neighbours whose messages contradict the ego's own detections.
     #[arg(long)]
     trust: bool,
-    /// Keep the maps of the encoder in this folder, so that each is computed once for many evaluations.
+    /// Keep the feature maps of the encoder in this folder, so that each is computed once for many evaluations.
     #[arg(long, value_name = "DIR")]
     maps: Option<PathBuf>,
-    /// Frames to judge at most, over all scenarios [default: all].
+    /// Largest number of frames to evaluate, over all scenarios [default: all].
     #[arg(long, value_parser = clap::value_parser!(u64).range(1..))]
     frames: Option<u64>,
-    /// Scenarios to judge at most, evenly spread [default: all].
+    /// Largest number of scenarios to evaluate, evenly spread [default: all].
     #[arg(long, value_parser = clap::value_parser!(u64).range(1..))]
     scenarios: Option<u64>,
-    /// Number that stored intensities are divided by [default: auto; `sim-replay inspect --help` says by what].
+    /// Number that stored intensities are divided by [default: auto; `sim-replay inspect --help` describes the rule].
     #[arg(long, value_name = "auto|1|255|NUMBER", default_value_t, hide_default_value = true)]
     intensity_scale: IntensityScale,
-    /// Threads to compute with, 1 to 256 [default: 1].
+    /// Number of compute threads, 1 to 256 [default: 1].
     #[arg(long)]
     threads: Option<Threads>,
     #[command(flatten)]
@@ -109,7 +111,7 @@ fn at_most(count: u64) -> usize {
 }
 
 impl Arguments {
-    /// Evaluates every method and prints the numbers.
+    /// Evaluates every method and prints the metrics.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
         let threads = self.threads.unwrap_or_default();
         threads.validate().map_err(bad)?;
@@ -145,7 +147,7 @@ impl Arguments {
         }
         let codec = self.codec.0;
         Ok(EvaluationOptions {
-            // Required where there is no table.
+            // Required without a table.
             dataset: self.dataset.clone().unwrap_or_default(),
             weights: self.weights.clone().unwrap_or_default(),
             pose_source: self.pose.0.clone(),

@@ -12,7 +12,7 @@ use support::cli::Outcome;
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct Arguments {
-    /// Folder of the keys: one folder for each process, and the authority's key, which belongs on no vehicle.
+    /// Folder of the keys: one folder per process, and the authority's key, which belongs on no vehicle.
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
     /// Vehicles: each gets a certificate for its agent.
@@ -21,13 +21,13 @@ pub(crate) struct Arguments {
     /// Vehicles that fuse: each gets certificates for its ego-fuser and for the link in front of it.
     #[arg(long, value_name = "CAV,..", value_delimiter = ',')]
     egos: Vec<CavId>,
-    /// Names or addresses under which the router is reached, beside localhost.
+    /// Names or addresses of the router, in addition to localhost.
     #[arg(long, value_name = "HOST,..", value_delimiter = ',')]
     hosts: Vec<String>,
-    /// Days that the certificates hold.
+    /// Lifetime of the certificates, days.
     #[arg(long, default_value_t = 30, value_parser = clap::value_parser!(u32).range(1..=3650))]
     days: u32,
-    /// Replace certificates that are there; the authority stays.
+    /// Replace existing certificates; the authority stays.
     #[arg(long)]
     force: bool,
     /// Print the files as JSON.
@@ -36,15 +36,16 @@ pub(crate) struct Arguments {
 }
 
 impl Arguments {
-    /// Writes the keys and names the files.
+    /// Writes the keys and lists the files.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
-        let mut parties: Vec<Principal> = self.agents.iter().map(|cav| Principal::new(Role::Agent, cav)).collect();
-        parties.extend(self.egos.iter().flat_map(|cav| [Role::Ego, Role::Link].map(|role| Principal::new(role, cav))));
-        // Later vehicles join a fleet whose other processes have theirs.
+        let mut principals: Vec<Principal> = self.agents.iter().map(|cav| Principal::new(Role::Agent, cav)).collect();
+        principals
+            .extend(self.egos.iter().flat_map(|cav| [Role::Ego, Role::Link].map(|role| Principal::new(role, cav))));
+        // Vehicles that are added later join a fleet whose other processes have certificates already.
         let others = [Role::Replay, Role::Scorer, Role::Recorder, Role::Viewer].map(Principal::alone);
-        let has_own = |party: &Principal| self.out.join(party.to_string()).exists();
-        parties.extend(others.into_iter().filter(|party| self.force || !has_own(party)));
-        let mut plan = KeyPlan::new(&self.out, parties, self.days);
+        let has_own = |principal: &Principal| self.out.join(principal.to_string()).exists();
+        principals.extend(others.into_iter().filter(|principal| self.force || !has_own(principal)));
+        let mut plan = KeyPlan::new(&self.out, principals, self.days);
         plan.hosts.extend(self.hosts);
         plan.lifetime = Duration::from_secs(u64::from(self.days) * 24 * 3600);
         plan.replace = self.force;

@@ -20,37 +20,39 @@ use dataset::LeftOut;
 use deploy::experiment::evaluation::EvaluationError;
 use deploy::experiment::sweep::SweepError;
 use deploy::experiment::table::TableError;
+use deploy::operate::RunError;
 use deploy::operate::fleet::FleetError;
-use deploy::operate::run_fleet::UpError;
 use deploy::scenario::ScenarioError;
 use support::cli::Outcome;
 use support::output;
 
-/// What `v2vloc` can be asked to do.
+/// Subcommands of `v2vloc`.
 #[derive(Debug, clap::Subcommand)]
 pub(crate) enum Command {
-    /// Generate a scene if there is none, run a fleet over it, print what came of it.
+    /// Generate a scene if there is none, run a fleet on it and print the result.
     Demo(Box<demo::Arguments>),
-    /// Judge methods on recorded scenes without a network: AP, pose errors, bytes.
+    /// Evaluate methods on recorded scenes without a network: AP, pose errors, bytes.
     Eval(Box<eval::Arguments>),
     /// Make a test authority and certificates for the processes of a fleet.
     Keys(keys::Arguments),
-    /// Be the router of a fleet whose processes run on several hosts, or write the configuration of a zenohd that is.
+    /// Run the router of a fleet whose processes are on several hosts, or write the configuration of a zenohd in its
+    /// place.
     Router(router::Arguments),
-    /// Print the JSON schema of a kind of file, for editors: those in deploy/scenarios and deploy/experiments are its output.
+    /// Print the JSON schema of a kind of file, for editors: the files in deploy/scenarios and deploy/experiments are
+    /// its output.
     Schema(schema::Arguments),
-    /// Run a grid of experiments in virtual time: one CSV, charts, a report.
+    /// Run a grid of experiments in simulation time: one CSV, charts, a report.
     Sweep(sweep::Arguments),
-    /// Say how a run goes: is every process there, ready and answering? Exit code 1 where something is wrong.
+    /// Report the state of a run: every process present, ready and answering? Exit code 1 if not.
     Status(status::Arguments),
     /// Start a fleet: processes, scene, models, network; Ctrl-C ends it.
     Up(Box<up::Arguments>),
-    /// Look at a run in a browser: the scene from above, the links, where the time goes.
+    /// Show a run in a browser: the scene from above, the links, the latency of each stage.
     View(view::Arguments),
 }
 
 impl Command {
-    /// Does what was asked.
+    /// Runs the subcommand.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
         malloc_settings::ensure(&malloc_settings::KEPT_MEMORY).context("this program again")?;
         match self {
@@ -67,7 +69,7 @@ impl Command {
     }
 }
 
-/// Prints what evaluations left out, each finding once, and the counts of the first that lacks anything.
+/// Prints what evaluations left out, each finding once, and the counts of the first incomplete one.
 fn left_out<'a>(all: impl Iterator<Item = &'a LeftOut>) -> Outcome {
     let mut sum = LeftOut::default();
     let mut first = None;
@@ -80,7 +82,7 @@ fn left_out<'a>(all: impl Iterator<Item = &'a LeftOut>) -> Outcome {
     outcome
 }
 
-/// Whether a cause of an error is a fault of usage or input, and not of the program.
+/// True if the cause of an error is a fault of usage or input, and not of the program.
 pub(crate) fn is_bad_input(cause: &(dyn Error + 'static)) -> bool {
     cause.is::<ScenarioError>()
         || cause.is::<FleetError>()
@@ -88,11 +90,11 @@ pub(crate) fn is_bad_input(cause: &(dyn Error + 'static)) -> bool {
         || cause.is::<TableError>()
         || BusError::is_behind(cause)
         || cause.downcast_ref::<SweepError>().is_some_and(SweepError::is_bad_input)
-        || cause.downcast_ref::<UpError>().is_some_and(UpError::is_bad_input)
+        || cause.downcast_ref::<RunError>().is_some_and(RunError::is_bad_input)
 }
 
-/// The folder of the programs: they are built and installed together.
+/// Folder of the programs: they are built and installed together.
 pub(crate) fn programs() -> anyhow::Result<PathBuf> {
-    let own = std::env::current_exe().context("where this program lies")?;
-    Ok(own.parent().context("this program lies nowhere")?.to_path_buf())
+    let own = std::env::current_exe().context("folder of this program")?;
+    Ok(own.parent().context("this program is in no folder")?.to_path_buf())
 }

@@ -13,28 +13,28 @@ use zenoh::Wait;
 
 use support::cli::Outcome;
 
-/// How often the router says what it has refused.
+/// Interval between reports of refused requests.
 const LOOK_ROUND: Duration = Duration::from_secs(5);
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct Arguments {
-    /// Where to listen, tcp/HOST:PORT; with --keys the same place speaks QUIC (UDP).
+    /// Endpoint to listen on, tcp/HOST:PORT; with --keys the same address speaks QUIC (UDP).
     #[arg(long, default_value = "tcp/127.0.0.1:7447")]
     listen: Endpoint,
-    /// Folder with the router's keys (`v2vloc keys` writes DIR/router): every process has to show a certificate, and may
-    /// do only what is its to do.
+    /// Folder with the router's keys (`v2vloc keys` writes DIR/router): every process has to show a certificate, and is
+    /// restricted to its own topics.
     #[arg(long, value_name = "DIR")]
     keys: Option<PathBuf>,
-    /// The only run that is let through [default: any].
+    /// The only run that is admitted [default: any].
     #[arg(long)]
     run: Option<RunId>,
-    /// Seconds that handing one message to one receiver may take before its connection is closed.
+    /// Longest time for handing one message to one receiver before its connection is closed, seconds.
     #[arg(long, default_value_t = 5.0, value_parser = seconds)]
     stall_limit: f64,
     /// Largest message, MiB.
     #[arg(long, default_value_t = 32)]
     max_message_mib: usize,
-    /// Write the same as a configuration for `zenohd -c FILE`, and do not run.
+    /// Write the same settings as a configuration for `zenohd -c FILE`, and do not run.
     #[arg(long, value_name = "FILE")]
     zenohd: Option<PathBuf>,
     /// End when standard input ends: for a supervisor that holds the other end of the pipe.
@@ -48,7 +48,7 @@ fn seconds(text: &str) -> Result<f64, String> {
 }
 
 impl Arguments {
-    /// Routes until Ctrl-C.
+    /// Routes messages until Ctrl-C.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
         let options = self.options()?;
         if let Some(path) = &self.zenohd {
@@ -65,13 +65,13 @@ impl Arguments {
         stop.enforce(STOP_LIMIT);
         let session = open(&options)?;
         output::note(format_args!("routing at {} (Ctrl-C ends it)", options.endpoint()));
-        let (mut refusals, mut said) = (RejectionLog::of(options.endpoint()), BTreeMap::new());
+        let (mut refusals, mut reported) = (RejectionLog::of(options.endpoint()), BTreeMap::new());
         loop {
             let ended = stop.wait_until(Instant::now() + LOOK_ROUND);
             if options.guard.is_some() {
                 refusals.update(&session);
                 for (refusal, count) in refusals.counts() {
-                    let before = said.insert(refusal.clone(), count).unwrap_or(0);
+                    let before = reported.insert(refusal.clone(), count).unwrap_or(0);
                     if count > before {
                         tracing::warn!(
                             peer = refusal.peer,

@@ -10,7 +10,7 @@ use support::cli::Outcome;
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct Arguments {
-    /// Folder of the run [default: of those in --runs the one that told about itself last].
+    /// Folder of the run [default: the one in --runs with the newest status].
     run: Option<PathBuf>,
     /// Folder of the run folders.
     #[arg(long, default_value = "runs")]
@@ -21,7 +21,7 @@ pub(crate) struct Arguments {
 }
 
 impl Arguments {
-    /// Prints how the run goes.
+    /// Prints the state of the run.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
         let bad_input = |error: deploy::operate::status::StatusError| BadInput::of(error);
         let folder = match self.run {

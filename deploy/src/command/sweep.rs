@@ -12,13 +12,13 @@ use support::cli::Outcome;
 pub(crate) struct Arguments {
     /// The experiment; deploy/experiments holds ready ones.
     experiment: PathBuf,
-    /// Folder of the results; runs that are done there already are not done again [default: sweeps/NAME].
+    /// Folder of the results; runs that it holds already are not repeated [default: sweeps/NAME].
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
-    /// Processes that compute, each with one thread. The results do not depend on it.
+    /// Number of compute processes, each with one thread. The results do not depend on it.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=256))]
     jobs: u16,
-    /// Only say how many runs there are and how long they will take.
+    /// Only print the number of runs and the time that they will take.
     #[arg(long)]
     dry_run: bool,
     /// Compute the runs whose numbers come on standard input, for another sweep.
@@ -27,7 +27,7 @@ pub(crate) struct Arguments {
 }
 
 impl Arguments {
-    /// RunScope the experiment and prints its table.
+    /// Runs the experiment and prints its table.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
         tch::set_num_threads(1);
         let out = match self.out {

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use deploy::experiment::report;
-use deploy::operate::run_fleet::{UpOptions, up};
+use deploy::run::run_fleet::{UpOptions, up};
 use deploy::scenario::Scenario;
 use fusion::Method;
 use protocol::RunId;
@@ -28,13 +28,14 @@ pub(crate) struct Arguments {
     /// Fusion method in place of the scenario's, one of `ego-fuser methods`.
     #[arg(long)]
     method: Option<Method>,
-    /// Ticks to play in place of the scenario's.
+    /// Number of ticks to play in place of the scenario's.
     #[arg(long)]
     frames: Option<usize>,
-    /// Write everything that is said to recording.mcap in the run folder; the scenario may say what to leave out.
+    /// Record all messages in recording.mcap in the run folder; the scenario may exclude some.
     #[arg(long)]
     record: bool,
-    /// Serve counters and times to Prometheus: the scorer here, the other processes on the ports behind it.
+    /// Serve counters and times to Prometheus: the scorer at this address, the other processes on the ports that
+    /// follow.
     #[arg(long, value_name = "HOST:PORT")]
     metrics: Option<std::net::SocketAddr>,
     /// Print metrics.json instead of a table.
@@ -43,7 +44,7 @@ pub(crate) struct Arguments {
 }
 
 impl Arguments {
-    /// RunScope the scenario and prints what came of it.
+    /// Runs the scenario and prints the result.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
         let mut scenario = Scenario::read(&self.scenario)?;
         if let Some(scene) = self.scene {

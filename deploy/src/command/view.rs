@@ -15,8 +15,8 @@ use support::output;
 use support::cli::BadInput;
 use support::cli::Outcome;
 
-/// How far behind the processes of a run its viewer stands for the processor. Not last of all: on a machine with nothing to
-/// spare a page would show nothing.
+/// Niceness of the viewer relative to the processes of a run. Not the largest value: on a machine without spare time
+/// the page would show nothing.
 const VIEWER_NICENESS: i32 = 15;
 
 #[derive(Debug, clap::Args)]
@@ -24,19 +24,19 @@ pub(crate) struct Arguments {
     /// Folder of a recorded run (`v2vloc up --record`), or its recording.mcap.
     #[arg(required_unless_present = "live", conflicts_with = "live")]
     run: Option<PathBuf>,
-    /// Show a run that goes on now; --name and --connect say which.
+    /// Show a live run, which --name and --connect identify.
     #[arg(long, requires_all = ["name", "connect"])]
     live: bool,
     /// Name of the live run.
     #[arg(long)]
     name: Option<RunId>,
-    /// The router of the live run, tcp/HOST:PORT; `v2vloc up` says it.
+    /// Router of the live run, tcp/HOST:PORT; `v2vloc up` prints it.
     #[arg(long)]
     connect: Option<Endpoint>,
     /// Folder with the viewer's keys, where the live run has security (`v2vloc keys` writes DIR/viewer).
     #[arg(long, value_name = "DIR")]
     keys: Option<PathBuf>,
-    /// Where to serve the page.
+    /// Address of the page.
     #[arg(long, value_name = "HOST:PORT", default_value = "127.0.0.1:8088")]
     listen: SocketAddr,
 }
@@ -56,7 +56,7 @@ impl Arguments {
                 serve_recorded(self.listen, Arc::new(run))
             }
             (None, Some(name), Some(router)) => {
-                // On the machine of the run, the run comes first.
+                // On the machine of the run, the run has priority.
                 let _ = rustix::process::nice(VIEWER_NICENESS);
                 let cav = CavId::new("viewer")?;
                 let identity = Identity { run: name.clone(), process: process_id(Role::Viewer, &cav), cav };
@@ -76,12 +76,12 @@ impl Arguments {
         let server = server.map_err(|error| BadInput::new(format!("cannot serve at {}: {error}", self.listen)))?;
         output::note(format_args!("http://{}/ (Ctrl-C ends it)", server.address()));
         while !stop.wait_until(Instant::now() + Duration::from_secs(3600)) {}
-        say_dropped(&server);
+        warn_dropped(&server);
         Ok(Outcome::Done)
     }
 }
 
-fn say_dropped(server: &WebServer) {
+fn warn_dropped(server: &WebServer) {
     let dropped = server.readers().dropped();
     if dropped > 0 {
         output::note(format_args!("{dropped} readers did not read and were dropped"));

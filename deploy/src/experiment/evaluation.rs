@@ -1,5 +1,4 @@
-//! A method on recorded scenes without a network: the numbers of a run in which nothing is late, or of one whose messages
-//! cross the emulated air in virtual time.
+//! Offline evaluation of a method on recorded scenes: without delays, or with link emulation in simulation time.
 
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
@@ -12,7 +11,7 @@ use dataset::evaluation_protocol::{EvaluationProtocol, ProtocolConfig};
 use dataset::{self, IntensityScale, OpenOptions, ReadError, Scenario};
 use ego_fuser::misbehaviour::MisbehaviourConfig;
 use ego_fuser_offline::evaluation::stepped::{ComputeTimes, SteppedConfig};
-use ego_fuser_offline::evaluation::{EvaluateConfig, EvaluateError, EvaluatedFrame, Evaluator};
+use ego_fuser_offline::evaluation::{EvaluateConfig, EvaluateError, Evaluator};
 use fusion::Exchange;
 use fusion::Method;
 use localization::pose_source::PoseSourceConfig;
@@ -20,66 +19,67 @@ use perception::weights::Weights;
 use protocol::{CavId, CodecConfig};
 use training::feature_store::{FeatureStore, KeptMaps, MapSource};
 
-use crate::experiment::metrics::Metrics;
-use crate::experiment::score::FrameScores;
-use crate::experiment::weights_choice::{WeightsChoiceError, weights_of};
+use crate::scenario::weights_choice::{WeightsChoiceError, weights_of};
+use crate::score::FrameScores;
+use crate::score::evaluated_frame::judge;
+use crate::score::metrics::Metrics;
 
-/// What to evaluate.
+/// Settings of an evaluation.
 #[derive(Debug, Clone, Default)]
 pub struct EvaluationOptions {
     /// Data set, split or scenario.
     pub dataset: PathBuf,
     /// Weights of the detector, or a folder that holds a file `<name>-<method>.safetensors` for each method.
     pub weights: PathBuf,
-    /// Where the vehicles' poses come from.
+    /// Source of the vehicles' poses.
     pub pose_source: PoseSourceConfig,
-    /// How feature maps are written.
+    /// Encoding of feature maps.
     pub codec: CodecConfig,
-    /// How neighbours fit them to what the air takes.
+    /// Adaptation of feature maps to the rate of the link.
     pub rate: RateConfig,
-    /// How long messages of neighbours are under way, nanoseconds.
+    /// Delay of the messages of neighbours, nanoseconds.
     pub delay_nanos: u64,
-    /// Neighbours that lie; absent: none.
+    /// Attack by neighbours; absent: none.
     pub attack: Option<AttackConfig>,
-    /// Whether the ego leaves out neighbours that it does not trust, and when.
+    /// Misbehaviour detection of the ego; absent: none.
     pub trust: Option<MisbehaviourConfig>,
-    /// Where maps of encoders are kept, so that each is computed once for many evaluations.
+    /// Cache of the encoders' feature maps, so that each is computed once for many evaluations.
     pub maps: Option<KeptMaps>,
-    /// Frames to judge at most, over all scenarios.
+    /// Largest number of frames to evaluate, over all scenarios.
     pub frames: Option<usize>,
-    /// The air that messages cross, in virtual time; absent: none.
+    /// Run in simulation time with link emulation; absent: no link.
     pub stepped: Option<SteppedConfig>,
-    /// The part of the data set that is judged.
+    /// Part of the data set to evaluate.
     pub part: Part,
-    /// Whose messages and annotations count, and which objects.
+    /// Participating vehicles, counted annotations and objects.
     pub protocol: ProtocolConfig,
 }
 
-/// A data set, opened to be judged by a protocol.
+/// Data set, opened for evaluation by a protocol.
 #[derive(Debug)]
 pub struct OpenedData {
-    /// The scenarios, with the agents that take part.
+    /// Scenarios, with the participating agents.
     pub scenarios: Vec<Scenario>,
-    /// The protocol.
+    /// Evaluation protocol.
     pub protocol: EvaluationProtocol,
-    /// Parts of the data set that are not used.
+    /// Parts of the data set that cannot be used.
     pub problems: Vec<ReadError>,
 }
 
 /// A part of a data set.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Part {
-    /// So many scenarios, evenly spread; all where absent.
+    /// Number of scenarios, evenly spread; absent: all.
     pub scenarios: Option<usize>,
-    /// The first so many ticks of each; all where absent.
+    /// Number of ticks from the start of each scenario; absent: all.
     pub ticks: Option<usize>,
     /// Divisor of the intensities of its sweeps.
     pub intensity_scale: IntensityScale,
 }
 
 impl Part {
-    /// Opens a data set: all its scenarios, each with the agents of the protocol and the ticks that are asked for. Maps are
-    /// kept of these, so that another choice among them needs no others.
+    /// Opens a data set: all its scenarios, each with the agents of the protocol and the requested ticks. Feature maps
+    /// are cached for all of them, so that another selection needs no others.
     ///
     /// # Errors
     /// [`EvaluationError`] when it cannot be read, or the protocol contradicts itself.
@@ -93,22 +93,22 @@ impl Part {
         Ok(OpenedData { scenarios, protocol, problems: dataset.problems })
     }
 
-    /// Those of all scenarios that are asked for.
+    /// The requested scenarios.
     pub fn chosen<'a>(&self, scenarios: &'a [Scenario]) -> impl Iterator<Item = &'a Scenario> {
         let count = self.scenarios.map_or(scenarios.len(), |most| most.min(scenarios.len()));
         (0..count).map(move |index| &scenarios[index * scenarios.len() / count])
     }
 }
 
-/// Why an evaluation came to nothing.
+/// Reason why an evaluation failed.
 #[derive(Debug, thiserror::Error)]
 pub enum EvaluationError {
-    /// There is no truth to judge by.
-    #[error("scenario {scenario} has no true poses of the ego {ego}: there is nothing to judge its results by")]
+    /// No ground truth for the evaluation.
+    #[error("scenario {scenario} has no true poses of the ego {ego}: its results cannot be evaluated")]
     NoPoses {
-        /// The scenario.
+        /// Name of the scenario.
         scenario: String,
-        /// Its ego.
+        /// Id of its ego.
         ego: CavId,
     },
     /// The data set cannot be read.
@@ -117,18 +117,18 @@ pub enum EvaluationError {
     /// The protocol is not known or contradicts itself.
     #[error("evaluation protocol: {0}")]
     Protocol(String),
-    /// The data set has no frame to judge.
+    /// The data set has no frame to evaluate.
     #[error("{}: there is no frame in it", .0.display())]
     Empty(PathBuf),
     /// There are no weights for a method.
     #[error(transparent)]
     Weights(#[from] WeightsChoiceError),
-    /// The pipeline refused.
+    /// Error of the pipeline.
     #[error(transparent)]
     Evaluate(#[from] EvaluateError),
 }
 
-/// Frames there are to judge in a data set, over all scenarios.
+/// Number of frames to evaluate in a data set, over all scenarios.
 ///
 /// # Errors
 /// [`EvaluationError`] when the data set cannot be read.
@@ -138,11 +138,11 @@ pub fn frame_count(options: &EvaluationOptions) -> Result<usize, EvaluationError
     Ok(options.frames.map_or(ticks, |frames| frames.min(ticks)))
 }
 
-/// RunScope one method over all scenarios, the first vehicle of each being the ego; `on_frame` is told of every frame. Frames
-/// and parts that cannot be read are left out and counted in [`Metrics::left_out`].
+/// Evaluates one method over all scenarios, the first vehicle of each being the ego; `on_frame` is called after every
+/// frame. Frames and parts that cannot be read are left out and counted in [`Metrics::left_out`].
 ///
 /// # Errors
-/// [`EvaluationError`] when the data set cannot be opened, and when no frame can be judged.
+/// [`EvaluationError`] when the data set cannot be opened, and when no frame can be evaluated.
 pub fn evaluate(
     options: &EvaluationOptions,
     method: Method,
@@ -152,7 +152,7 @@ pub fn evaluate(
     Ok(metrics(&board, &evaluator, options, began))
 }
 
-/// The same with the board itself, for those who want to know more than the numbers.
+/// Like [`evaluate`], but returns the scores of all frames in addition to the metrics.
 ///
 /// # Errors
 /// As [`evaluate`].
@@ -186,7 +186,7 @@ pub(crate) fn judged(
     let channels = evaluator.ego().detector().config().sent_channels();
     let map_values = u64::from(grid.width) * u64::from(grid.height) * u64::try_from(channels).unwrap_or(0);
     let left = options.frames.unwrap_or(usize::MAX);
-    // Without a time to compute, a result is as old as its sweep by definition: that is no latency.
+    // Without a compute time, a result is as old as its sweep by definition, which is no latency.
     let is_timed = options.stepped.as_ref().is_some_and(|stepped| stepped.compute != ComputeTimes::NONE);
     let mut board: Option<FrameScores> = None;
     for scenario in options.part.chosen(&scenarios) {
@@ -210,21 +210,11 @@ pub(crate) fn judged(
     Ok((board, evaluator, began))
 }
 
-/// The maps of all sweeps, encoded now where they have not been before.
+/// Feature maps of all sweeps, from the cache or encoded now.
 fn maps(kept: &KeptMaps, weights: &Path, scenarios: &[Scenario]) -> Result<MapSource, EvaluationError> {
     let weights = Arc::new(Weights::load(weights).map_err(EvaluateError::from)?);
     let store = FeatureStore::open(kept, &weights, scenarios, &mut |_, _| {});
     Ok(MapSource::new(Arc::new(store.map_err(|error| EvaluateError::from(Box::new(error)))?), weights))
-}
-
-/// Judges a frame; where computers take a time its stamp says when it was published.
-pub(crate) fn judge(board: &mut FrameScores, frame: EvaluatedFrame, is_timed: bool) {
-    let EvaluatedFrame { tick, stamp, result, frames, poses, objects } = frame;
-    let poses: Vec<_> = frames.iter().map(|frame| frame.cav.clone()).zip(poses).collect();
-    let truth: Vec<(CavId, _)> =
-        frames.iter().filter_map(|frame| Some((frame.cav.clone(), frame.world_from_lidar?))).collect();
-    let latency_ms = is_timed.then(|| (stamp.publish_nanos - stamp.capture_nanos) as f64 / 1e6);
-    board.judge_whole((tick as u64, stamp.capture_nanos), latency_ms, result, objects, &poses, truth);
 }
 
 pub(crate) fn metrics(

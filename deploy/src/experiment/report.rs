@@ -1,4 +1,4 @@
-//! Results as tables for people.
+//! Results as tables for a terminal.
 
 use std::fmt::Write as _;
 
@@ -6,17 +6,17 @@ use fusion::Exchange;
 use fusion::Method;
 use support::text_table::{Side, TextTable};
 
-use crate::experiment::metrics::{Answered, ByIou, Contribution, Metrics, Percentiles};
-use crate::experiment::progress::bytes;
-use crate::operate::run_fleet::RunResult;
+use crate::operate::progress::bytes;
+use crate::run::run_fleet::RunResult;
+use crate::score::metrics::{Answered, ByIou, Contribution, Metrics, Percentiles};
 
-/// A run as a table: what was found, how fast, at which price.
+/// Table of a run: detections, latency, bytes.
 #[must_use]
 pub fn run_table(result: &RunResult) -> String {
     table(std::slice::from_ref(&result.metrics)) + &run_notes(result)
 }
 
-/// What there is to say of one run below its line in the table.
+/// Lines about one run below its row of the table.
 #[must_use]
 pub fn run_notes(result: &RunResult) -> String {
     let mut text = String::new();
@@ -58,7 +58,7 @@ pub fn run_notes(result: &RunResult) -> String {
     text
 }
 
-/// One line per run or evaluation, and what has to be known to compare the lines.
+/// One line per run or evaluation, and the facts that are needed to compare the lines.
 #[must_use]
 pub fn table(all: &[Metrics]) -> String {
     let mut columns = vec![
@@ -88,11 +88,11 @@ pub fn table(all: &[Metrics]) -> String {
     lines(&columns, all.len()) + &comparison(all)
 }
 
-/// AP by the overlap that it is at.
+/// Name of an IoU threshold, and its AP.
 type AtOverlap = (&'static str, fn(&ByIou) -> Option<f64>);
 const BY_IOU: [AtOverlap; 3] = [("0.3", |ap| ap.at_30), ("0.5", |ap| ap.at_50), ("0.7", |ap| ap.at_70)];
 
-/// What keeps lines of a table from being compared, and what the air has kept from an ego.
+/// Notes for a comparison: differences between runs, and messages that did not reach an ego.
 fn comparison(all: &[Metrics]) -> String {
     let mut text = String::new();
     if all.windows(2).any(|pair| pair[0].frames != pair[1].frames) {
@@ -102,7 +102,7 @@ fn comparison(all: &[Metrics]) -> String {
             }
             false => "their AP cannot be compared",
         };
-        let _ = writeln!(text, "\nwarning: lines are judged over different frames: {compare}");
+        let _ = writeln!(text, "\nwarning: rows are evaluated over different frames: {compare}");
     }
     for Metrics { method, contribution: Contribution { sent, used, sent_bytes_mean, .. }, .. } in all {
         if let Some(what) = shared(method).filter(|_| used < sent) {
@@ -113,10 +113,10 @@ fn comparison(all: &[Metrics]) -> String {
     text
 }
 
-/// What an ego fuses of its neighbours by a method; none where it fuses nothing.
+/// Data of the neighbours that a method fuses; `None` if it fuses none.
 fn shared(method: &str) -> Option<&'static str> {
     match method.parse().map(Method::exchange) {
-        Ok(Exchange::Features) => Some("maps"),
+        Ok(Exchange::Features) => Some("feature maps"),
         Ok(Exchange::Boxes) => Some("lists of boxes"),
         Ok(Exchange::Points) => Some("clouds"),
         Ok(Exchange::Nothing) | Err(_) => None,
@@ -137,13 +137,13 @@ fn latency(metrics: &Metrics) -> String {
     }
 }
 
-/// Of what was fused, or where nothing was, of what was sent.
+/// Wire bytes of the fused messages, or if there were none, of all messages sent.
 fn wire_bytes(metrics: &Metrics) -> String {
     let mean = metrics.comm.wire_bytes_mean.or(metrics.contribution.sent_bytes_mean);
     mean.map_or("-".into(), bytes)
 }
 
-/// A column of the table.
+/// Column of the table.
 struct Column {
     name: String,
     side: Side,
@@ -178,7 +178,7 @@ mod tests {
     use super::*;
     use dataset::LeftOut;
 
-    use crate::experiment::metrics::{Communication, Latencies, Messages, PoseErrors};
+    use crate::score::metrics::{Communication, Latencies, Messages, PoseErrors};
 
     fn metrics(method: &str, at_50: Option<f64>) -> Metrics {
         Metrics {
@@ -223,21 +223,21 @@ mod tests {
         let lines: Vec<&str> = text.lines().collect();
         assert!(lines[1].contains("33/60") && lines[2].contains("29/60"), "{text}");
         assert!(lines[1].contains("0.400") && lines[1].contains("0.200"), "all ticks and streaming: {text}");
-        assert!(text.contains("warning: lines are judged over different frames"), "{text}");
+        assert!(text.contains("warning: rows are evaluated over different frames"), "{text}");
         assert!(!table(&[answered("max", 60, 0.8), answered("none", 60, 0.7)]).contains("warning"));
     }
 
     #[test]
-    fn what_the_air_kept_back_is_told() {
+    fn undelivered_messages_are_reported() {
         let contribution =
             Contribution { fused_per_frame: Some(0.05), sent: 38, used: 2, sent_bytes_mean: Some(3_150_000.0) };
         let latency_ms = Latencies::default();
-        let alone = Metrics { contribution, ..metrics("none", Some(0.7)) };
-        assert!(!table(&[alone]).contains("arrived in time"), "it fuses nothing in any case");
+        let ego_only = Metrics { contribution, ..metrics("none", Some(0.7)) };
+        assert!(!table(&[ego_only]).contains("arrived in time"), "it fuses nothing in any case");
         let text = table(&[Metrics { contribution, latency_ms, ..metrics("max", Some(0.8)) }]);
         assert!(text.contains("neighbours fused per frame") && text.contains("0.05"), "{text}");
-        assert!(text.contains("max: of 38 maps of 3.1 MB each 2 arrived in time"), "{text}");
+        assert!(text.contains("max: of 38 feature maps of 3.1 MB each 2 arrived in time"), "{text}");
         assert!(!text.contains(" / "), "no latency is known: {text}");
-        assert!(!table(&[metrics("max", None)]).contains("neighbours fused"), "nothing crossed any air");
+        assert!(!table(&[metrics("max", None)]).contains("neighbours fused"), "nothing was transmitted");
     }
 }

@@ -1,4 +1,4 @@
-//! The agents of a run in virtual time as processes of their own.
+//! Agents of a run in simulation time, one process each.
 
 use std::path::Path;
 use std::sync::mpsc::channel;
@@ -11,19 +11,19 @@ use ego_fuser_offline::evaluation::EvaluateError;
 use ego_fuser_offline::evaluation::stepped::RemotePool;
 use protocol::{CavId, ProcessId, RunId};
 
+use crate::operate::RunError;
 use crate::operate::fleet::{Fleet, SessionContext};
 use crate::operate::network::RouterEndpoint;
-use crate::operate::run_fleet::UpError;
 use crate::operate::run_folder::RunFolder;
 use crate::operate::security::RunKeys;
 use crate::operate::supervise::{ProcessEventKind, Supervisor};
 
-/// What the process that hands out the sweeps is called on the bus.
+/// Name on the bus of the process that distributes the sweeps.
 const NAME: &str = "stepped";
-/// How long the session may take to close.
+/// Longest time for closing the session.
 const LEAVE_LIMIT: Duration = Duration::from_secs(2);
 
-/// The processes, and where they meet.
+/// Agent processes and their session.
 pub(crate) struct CrewProcesses {
     supervisor: Supervisor,
     bus: Bus,
@@ -33,16 +33,16 @@ pub(crate) struct CrewProcesses {
 }
 
 impl CrewProcesses {
-    /// Starts an agent for each vehicle and waits until all are there.
+    /// Starts an agent for each vehicle and waits until all have joined.
     ///
     /// # Errors
-    /// [`UpError`] when they cannot meet.
+    /// [`RunError`] when they cannot connect.
     pub(crate) fn start(
         fleet: &Fleet,
         run: &RunId,
         folder: &RunFolder,
         programs: &Path,
-    ) -> Result<(Self, RemotePool), UpError> {
+    ) -> Result<(Self, RemotePool), RunError> {
         let keys = fleet.keys(folder)?;
         let place = RouterEndpoint::open(&fleet.scenario.network, run, keys.as_ref())?;
         let endpoint = &place.endpoint;
@@ -55,7 +55,7 @@ impl CrewProcesses {
         };
         let bus = Bus::over(place.session.clone(), identity)?;
         let (events, happened) = channel();
-        // Who starts anew has forgotten what came before, and the result would depend on when it fell.
+        // A restarted agent has lost its state, and the result would depend on the time of the crash.
         let supervisor = Supervisor::start(specs, &folder.log_dir(), 0, &events)?;
         let stop = Stop::new();
         thread::spawn({
@@ -78,7 +78,7 @@ impl CrewProcesses {
         Ok((Self { supervisor, bus, place, grace, _keys: keys }, remote))
     }
 
-    /// Ends all; the names of those that had to be killed.
+    /// Ends all processes; returns the names of those that had to be killed.
     pub(crate) fn end(self) -> Vec<String> {
         let Self { supervisor, bus, place, grace, _keys } = self;
         let killed = supervisor.stop(grace).killed;

@@ -1,4 +1,4 @@
-//! What went wrong with single processes of a run that goes on without what they were to do: the run ends with exit code 3.
+//! Failures of single processes in a run that continues without them: the run ends with exit code 3.
 
 use std::collections::BTreeMap;
 
@@ -7,30 +7,30 @@ use sim_replay::recorder::RecordReport;
 use crate::operate::fleet::RECORDER;
 use crate::operate::supervise::{ProcessEvent, ProcessEventKind};
 
-/// The failures of a run, by process.
+/// Failures of a run, by process.
 #[derive(Debug, Default)]
 pub(crate) struct Failures {
-    /// In words.
+    /// Description of the failure, by process.
     failed: BTreeMap<String, String>,
     /// The last line of each process's report.
-    said: BTreeMap<String, String>,
+    last_line: BTreeMap<String, String>,
 }
 
 impl Failures {
-    /// Takes note of what happened; what is wrong with the process from now on, in words.
+    /// Records an event; returns the failure of the process from now on, as text.
     pub(crate) fn note(&mut self, event: &ProcessEvent) -> Option<&str> {
         let ProcessEvent { name, what } = event;
-        let words = match what {
+        let text = match what {
             ProcessEventKind::Said { line } if name == RECORDER => {
                 serde_json::from_str::<RecordReport>(line).ok()?.loss_in_words()?
             }
             ProcessEventKind::Said { line } => {
-                self.said.insert(name.clone(), line.clone());
+                self.last_line.insert(name.clone(), line.clone());
                 return None;
             }
-            // Its report tells why.
+            // Its report gives the reason.
             ProcessEventKind::Done { data_lost: true } if self.failed.contains_key(name) => return None,
-            ProcessEventKind::Done { data_lost: true } => match self.said.get(name) {
+            ProcessEventKind::Done { data_lost: true } => match self.last_line.get(name) {
                 Some(line) => format!("data were lost: {line}"),
                 None => "data were lost; see its log".into(),
             },
@@ -41,13 +41,13 @@ impl Failures {
             | ProcessEventKind::Fell { .. }
             | ProcessEventKind::Done { data_lost: false } => return None,
         };
-        self.failed.insert(name.clone(), words);
+        self.failed.insert(name.clone(), text);
         self.failed.get(name).map(String::as_str)
     }
 
-    /// Each of them with the name of its process.
+    /// Description of each failure, after the name of its process.
     pub(crate) fn in_words(&self) -> Vec<String> {
-        self.failed.iter().map(|(name, words)| format!("{name}: {words}")).collect()
+        self.failed.iter().map(|(name, text)| format!("{name}: {text}")).collect()
     }
 }
 
@@ -77,15 +77,15 @@ mod tests {
     }
 
     #[test]
-    fn a_recording_that_is_cut_is_told_with_what_helps() {
+    fn a_cut_recording_is_reported_with_the_remedy() {
         let events = [
             ("recorder", report(Some("disk full"), 0)),
             ("recorder", report(Some("disk full"), 344)),
             ("recorder", ProcessEventKind::Done { data_lost: true }),
         ];
-        let words = "recorder: recording cut at 0.9 s: disk full, 344 messages missing; \
+        let text = "recorder: recording cut at 0.9 s: disk full, 344 messages missing; \
                      sim-replay recover runs/a/recording.mcap --out runs/a/recording.whole.mcap";
-        assert_eq!(noted(&events), [words]);
+        assert_eq!(noted(&events), [text]);
         assert!(
             noted(&[("recorder", report(None, 0)), ("recorder", ProcessEventKind::Done { data_lost: false })])
                 .is_empty()
@@ -94,13 +94,13 @@ mod tests {
 
     #[test]
     fn every_process_counts() {
-        let said = |line: &str| ProcessEventKind::Said { line: line.into() };
+        let last_line = |line: &str| ProcessEventKind::Said { line: line.into() };
         let events = [
-            ("replay", said("7 ticks were not answered")),
+            ("replay", last_line("7 ticks were not answered")),
             ("replay", ProcessEventKind::Done { data_lost: true }),
             ("link-1", ProcessEventKind::Failed { how: "ended with code 1".into() }),
             ("agent-1", ProcessEventKind::Started { pid: 1 }),
-            ("agent-1", said("40 sweeps")),
+            ("agent-1", last_line("40 sweeps")),
             ("agent-1", ProcessEventKind::Done { data_lost: false }),
             ("recorder", ProcessEventKind::GaveUp { how: "was ended by signal 9".into(), is_optional: true }),
         ];

@@ -24,37 +24,37 @@ use tch::Device;
 
 pub use self::error::FleetError;
 pub use self::processes::SessionContext;
-use crate::experiment::weights_choice::weights_of;
 use crate::operate::keys::KeyError;
 use crate::operate::run_folder::RunFolder;
 use crate::operate::security::RunKeys;
 use crate::scenario::Scenario;
+use crate::scenario::weights_choice::weights_of;
 
 /// Name of the process that plays the scene.
 pub const REPLAY: &str = "replay";
-/// Name of the process that writes everything down.
+/// Name of the process that records all messages.
 pub const RECORDER: &str = "recorder";
 
-/// A scenario with everything filled in that it leaves open.
+/// A scenario in which every open setting is filled in.
 #[derive(Debug, Clone)]
 pub struct Fleet {
     /// The scenario, with scene and vehicles named.
     pub scenario: Scenario,
     /// Every vehicle that takes part, in the scene's order.
     pub agents: Vec<CavId>,
-    /// The fusing one.
+    /// The fusing vehicle.
     pub ego: CavId,
-    /// Ticks that will be played; `None`: until someone ends it.
+    /// Number of ticks to play; `None`: until the run is ended.
     pub ticks: Option<usize>,
     /// Folder of the recorded scenario, for its hash.
     pub scene_dir: PathBuf,
-    /// The model, as its weights say.
+    /// Configuration of the model, from its weights.
     pub detector: DetectorConfig,
-    /// How the run is judged.
+    /// Evaluation protocol of the run.
     pub protocol: EvaluationProtocol,
 }
 
-/// Refuses options of a protocol that a live run has other fields for.
+/// Refuses options of a protocol that a live run takes from other fields.
 fn chosen_elsewhere(protocol: &ProtocolConfig) -> Result<(), FleetError> {
     let options = [
         ("agents", protocol.agents.is_some()),
@@ -68,10 +68,10 @@ fn chosen_elsewhere(protocol: &ProtocolConfig) -> Result<(), FleetError> {
 }
 
 impl Fleet {
-    /// Looks into scene and weights.
+    /// Reads scene and weights.
     ///
     /// # Errors
-    /// [`FleetError`] says what the scene or the weights lack.
+    /// [`FleetError`] names what the scene or the weights lack.
     pub fn plan(scenario: &Scenario) -> Result<Self, FleetError> {
         let mut scenario = scenario.clone();
         scenario.models.weights = weights_of(&scenario.models.weights, scenario.method)?;
@@ -135,20 +135,20 @@ impl Fleet {
         Ok(Self { scenario, agents, ego, ticks, scene_dir, detector, protocol })
     }
 
-    /// Which objects count: those of the protocol that lie over the area of the model.
+    /// Rule of the counted objects: those of the protocol inside the area of the model.
     #[must_use]
     pub fn ground_truth_rule(&self) -> GroundTruthRule {
         self.protocol.rule_within(self.detector.lidar_range_m)
     }
 
-    /// Numbers in one feature map of the model, as it crosses the air.
+    /// Number of values in one feature map of the model, as transmitted.
     #[must_use]
     pub fn map_values(&self) -> u64 {
         let grid = self.detector.feature_grid();
         u64::from(grid.width) * u64::from(grid.height) * self.detector.sent_channels() as u64
     }
 
-    /// Where poses come from: the name that all vehicles share, or `mixed`.
+    /// Name of the pose source that all vehicles share, or `mixed`.
     #[must_use]
     pub fn pose_source(&self) -> &'static str {
         let mut names = self.agents.iter().map(|cav| self.scenario.settings_of(cav).pose.name());
@@ -156,7 +156,7 @@ impl Fleet {
         if names.all(|name| name == first) { first } else { "mixed" }
     }
 
-    /// Every process that the run may have, for its keys.
+    /// Principal of every process that the run may have, for its keys.
     #[must_use]
     pub fn parties(&self) -> Vec<Principal> {
         let agents = self.agents.iter().map(|cav| Principal::new(Role::Agent, cav));
@@ -165,7 +165,7 @@ impl Fleet {
         agents.chain(egos).chain(others).collect()
     }
 
-    /// The keys of a run of this fleet, where its scenario asks for security.
+    /// Keys of a run of this fleet, if its scenario asks for security.
     ///
     /// # Errors
     /// [`KeyError`] when they cannot be made.
@@ -174,7 +174,7 @@ impl Fleet {
         security.map(|security| RunKeys::of(security, self.parties(), folder.path())).transpose()
     }
 
-    /// The executables of a fleet.
+    /// Executables of a fleet.
     #[must_use]
     pub fn programs(programs: &Path) -> Vec<PathBuf> {
         ["agent", "ego-fuser", "sim-replay", "v2vloc"].iter().map(|name| programs.join(name)).collect()
@@ -184,13 +184,13 @@ impl Fleet {
         self.agents.iter().filter(|cav| **cav != self.ego)
     }
 
-    /// Messages of every vehicle beside its pose.
+    /// Messages that every vehicle publishes in addition to its pose.
     pub(crate) fn publish(&self) -> Publish {
         publish(self.scenario.method)
     }
 }
 
-/// Messages that a method needs of every vehicle; the ego's own agent sends its map even where no other counts.
+/// Messages that a method needs of every vehicle; the ego's own agent sends its feature map even where no other counts.
 fn publish(method: Method) -> Publish {
     match method.exchange() {
         Exchange::Nothing | Exchange::Features => Publish::Bev,
@@ -199,7 +199,7 @@ fn publish(method: Method) -> Publish {
     }
 }
 
-/// How a scenario's data set is opened.
+/// Options with which a scenario's data set is opened.
 pub(crate) fn open_options(scene: &SceneConfig) -> OpenOptions {
     OpenOptions { intensity_scale: scene.intensity_scale, ..OpenOptions::default() }
 }

@@ -1,7 +1,7 @@
-//! What is known of each process of a run while it goes: does it run, is it ready, does it still say anything.
+//! State of each process during a run: running, ready, silent or hung.
 //!
-//! Every process tells twice a second how its books stand ([`protocol::Stats`]). From the first time on it is ready; one
-//! that falls silent for longer than the scenario allows hangs, and is replaced.
+//! Every process publishes its message counters twice a second ([`protocol::Stats`]). After the first report it is
+//! ready; one that is silent for longer than the scenario allows is hung, and is replaced.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -11,77 +11,78 @@ use serde::{Deserialize, Serialize};
 
 use crate::operate::supervise::{ProcessEvent, ProcessEventKind};
 
-/// Without news for so long, a process is shown as silent.
+/// Time without a report after which a process is shown as silent.
 const SILENT: Duration = Duration::from_millis(1500);
-/// An own pause of this length says that this program, or the whole machine, was stopped, and nothing of the others.
+/// A gap of this length in the own loop means that this program, or the whole machine, was stopped; it is no evidence
+/// about the other processes.
 const OWN_PAUSE: Duration = Duration::from_secs(1);
 
-/// How a process is.
+/// State of a process.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum State {
-    /// It runs and has not said anything yet.
+    /// Running, no report yet.
     Starting,
-    /// It has joined the run and goes on telling about itself.
+    /// Has joined the run and reports regularly.
     Ready,
-    /// It goes on telling about itself, but has failed in what it was to do.
+    /// Reports regularly, but has failed in its task.
     Failing,
-    /// It runs but has said nothing for a while.
+    /// Running, but without a report for a while.
     Silent,
-    /// It has fallen and will be started again.
+    /// Crashed, about to be restarted.
     Fallen,
-    /// It has ended as it should.
+    /// Ended as expected.
     Ended,
-    /// It has fallen and stays down.
+    /// Crashed and not restarted.
     Down,
 }
 
-/// A process as it is now.
+/// Status of a process.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ProcessStatus {
     /// Name in messages, and of its log.
     pub name: String,
-    /// How it is.
+    /// State.
     pub state: State,
     /// Process id, while it runs.
     pub pid: Option<u32>,
-    /// Since it was started last, seconds.
+    /// Time since the last start, seconds.
     pub up_s: f64,
-    /// Times that it was started again.
+    /// Number of restarts.
     pub restarts: u32,
-    /// How it fell last, in words.
+    /// Description of its last crash.
     pub last_fall: Option<String>,
-    /// What it has failed in, in words.
+    /// Description of its failure, for a process that has failed in its task.
     #[serde(default)]
     pub failure: Option<String>,
-    /// Since it said something, seconds.
+    /// Time since its last report, seconds.
     pub silent_s: Option<f64>,
     /// Resident memory, MiB.
     pub resident_mib: Option<f64>,
-    /// Threads.
+    /// Number of threads.
     pub threads: Option<u64>,
-    /// Open descriptors.
+    /// Number of open descriptors.
     pub descriptors: Option<u64>,
 }
 
-/// What is noted of a process.
+/// Record of one process.
 #[derive(Debug)]
 struct Noted {
     state: State,
     pid: Option<u32>,
     started: Instant,
-    /// Since this start.
-    heard: Option<Instant>,
+    /// Last report since this start.
+    last_report: Option<Instant>,
     restarts: u32,
     last_fall: Option<String>,
     failure: Option<String>,
 }
 
-/// Keeps watch over the processes of a run.
+/// Monitors the processes of a run.
 #[derive(Debug)]
 pub struct Health {
     processes: BTreeMap<String, Noted>,
-    /// Longest silence of a process that is ready.
+    /// Longest silence of a ready process.
     hang: Duration,
     /// Longest silence after a start.
     start: Duration,
@@ -89,19 +90,19 @@ pub struct Health {
 }
 
 impl Health {
-    /// Nothing runs yet. A process that is silent for `hang`, or for `start` after it was started, is to be replaced.
+    /// No process yet. One that is silent for `hang`, or for `start` after it was started, is to be replaced.
     #[must_use]
     pub fn new(hang: Duration, start: Duration) -> Self {
         Self { processes: BTreeMap::new(), hang, start, looked: Instant::now() }
     }
 
-    /// Takes note of what happened to a process.
+    /// Records an event of a process.
     pub fn note(&mut self, event: &ProcessEvent, now: Instant) {
         let noted = self.processes.entry(event.name.clone()).or_insert_with(|| Noted {
             state: State::Starting,
             pid: None,
             started: now,
-            heard: None,
+            last_report: None,
             restarts: 0,
             last_fall: None,
             failure: None,
@@ -112,7 +113,7 @@ impl Health {
                     state: State::Starting,
                     pid: Some(*pid),
                     started: now,
-                    heard: None,
+                    last_report: None,
                     restarts: noted.restarts,
                     last_fall: noted.last_fall.take(),
                     failure: noted.failure.take(),
@@ -131,50 +132,52 @@ impl Health {
         }
     }
 
-    /// Takes note of what a process has failed in.
-    pub fn fails(&mut self, name: &str, words: &str) {
+    /// Records the failure of a process.
+    pub fn fails(&mut self, name: &str, text: &str) {
         if let Some(noted) = self.processes.get_mut(name) {
-            noted.failure = Some(words.to_owned());
+            noted.failure = Some(text.to_owned());
         }
     }
 
-    /// Looks who has been heard when, and returns those that hang, with what is wrong in words.
-    pub fn look(&mut self, heard: &BTreeMap<String, Instant>, now: Instant) -> Vec<(String, String)> {
-        let was_away = now.saturating_duration_since(self.looked) > OWN_PAUSE;
+    /// Updates the states from the times of the last reports; returns the hung processes, each with a description.
+    pub fn look(&mut self, last_reports: &BTreeMap<String, Instant>, now: Instant) -> Vec<(String, String)> {
+        let was_stopped = now.saturating_duration_since(self.looked) > OWN_PAUSE;
         self.looked = now;
-        // This program hears itself too: where it hears nobody at all, the network is away, and nobody hangs.
-        let hears = heard.is_empty() || heard.values().any(|at| now.saturating_duration_since(*at) <= SILENT);
+        // The reports of this program come over the same bus. Without any report at all, the network is down, and no
+        // process counts as hung.
+        let network_is_up =
+            last_reports.is_empty() || last_reports.values().any(|at| now.saturating_duration_since(*at) <= SILENT);
         let mut hanging = Vec::new();
         for (name, noted) in &mut self.processes {
             if noted.pid.is_none() {
                 continue;
             }
-            // The last words of an earlier life may come after its end.
-            let last = heard.get(name).copied().filter(|at| *at > noted.started + SILENT / 3);
-            noted.heard = noted.heard.max(last);
-            if was_away {
-                // What would have been heard meanwhile was not listened to.
+            // The last reports of the previous process instance may arrive after its end.
+            let last = last_reports.get(name).copied().filter(|at| *at > noted.started + SILENT / 3);
+            noted.last_report = noted.last_report.max(last);
+            if was_stopped {
+                // Reports of that time were not received.
                 noted.started = noted.started.max(now.checked_sub(SILENT).unwrap_or(now));
-                noted.heard = noted.heard.map(|_| now);
+                noted.last_report = noted.last_report.map(|_| now);
             }
-            let (since, patience) = match noted.heard {
-                Some(heard) => (now.saturating_duration_since(heard), self.hang),
+            let (since, patience) = match noted.last_report {
+                Some(last_report) => (now.saturating_duration_since(last_report), self.hang),
                 None => (now.saturating_duration_since(noted.started), self.start),
             };
-            noted.state = match noted.heard {
+            noted.state = match noted.last_report {
                 None => State::Starting,
                 Some(_) if since > SILENT => State::Silent,
                 Some(_) if noted.failure.is_some() => State::Failing,
                 Some(_) => State::Ready,
             };
-            if since > patience && hears {
-                hanging.push((name.clone(), format!("has said nothing for {:.1} s", since.as_secs_f64())));
+            if since > patience && network_is_up {
+                hanging.push((name.clone(), format!("has not reported for {:.1} s", since.as_secs_f64())));
             }
         }
         hanging
     }
 
-    /// Every process as it is now.
+    /// Status of every process.
     #[must_use]
     pub fn statuses(&self, now: Instant) -> Vec<ProcessStatus> {
         let seconds = |at: Instant| now.saturating_duration_since(at).as_secs_f64();
@@ -188,7 +191,7 @@ impl Health {
                 restarts: noted.restarts,
                 last_fall: noted.last_fall.clone(),
                 failure: noted.failure.clone(),
-                silent_s: noted.heard.filter(|_| noted.pid.is_some()).map(seconds),
+                silent_s: noted.last_report.filter(|_| noted.pid.is_some()).map(seconds),
                 resident_mib: usage.resident_mib,
                 threads: usage.threads,
                 descriptors: usage.descriptors,
@@ -198,19 +201,19 @@ impl Health {
     }
 }
 
-/// What a process uses, as the system says.
+/// Resources of a process, from `/proc`.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Usage {
-    /// Resident memory, MiB.
+    /// Number of threads.
     pub resident_mib: Option<f64>,
-    /// Threads.
+    /// Number of open descriptors.
     pub threads: Option<u64>,
     /// Open descriptors.
     pub descriptors: Option<u64>,
 }
 
 impl Usage {
-    /// Of the process `pid`; none when it is gone.
+    /// Of the process `pid`; empty when it has ended.
     #[must_use]
     pub fn of(pid: u32) -> Option<Self> {
         let text = fs::read_to_string(format!("/proc/{pid}/status")).ok()?;
@@ -234,7 +237,7 @@ mod tests {
         ProcessEvent { name: name.into(), what }
     }
 
-    /// A watch over one process that was started at the returned moment.
+    /// Monitor of one process that was started at the returned time.
     fn watch() -> (Health, Instant) {
         let mut health = Health::new(Duration::from_secs(5), Duration::from_secs(60));
         let began = Instant::now();
@@ -242,18 +245,18 @@ mod tests {
         (health, began)
     }
 
-    /// Looks every 100 ms from `from_ms` to `to_ms` at a process that was last heard at `heard_ms`.
-    fn look(health: &mut Health, began: Instant, [from_ms, to_ms, heard_ms]: [u64; 3]) -> Vec<(String, String)> {
+    /// Updates every 100 ms from `from_ms` to `to_ms`, for a process with its last report at `report_ms`.
+    fn look(health: &mut Health, began: Instant, [from_ms, to_ms, report_ms]: [u64; 3]) -> Vec<(String, String)> {
         let at = |ms| began + Duration::from_millis(ms);
         let look = |ms| {
-            let heard = BTreeMap::from([("ego".to_owned(), at(heard_ms)), ("scorer".to_owned(), at(ms))]);
-            health.look(&heard, at(ms))
+            let last_reports = BTreeMap::from([("ego".to_owned(), at(report_ms)), ("scorer".to_owned(), at(ms))]);
+            health.look(&last_reports, at(ms))
         };
         (from_ms..=to_ms).step_by(100).flat_map(look).collect()
     }
 
     #[test]
-    fn who_falls_silent_is_shown_and_then_replaced() {
+    fn a_silent_process_is_shown_and_then_replaced() {
         let (mut health, began) = watch();
         assert!(look(&mut health, began, [0, 900, 0]).is_empty());
         let state = |health: &Health| health.statuses(began)[0].state;
@@ -263,7 +266,7 @@ mod tests {
         assert!(look(&mut health, began, [1600, 5900, 1000]).is_empty());
         assert_eq!(state(&health), State::Silent);
         let hanging = look(&mut health, began, [6000, 6100, 1000]);
-        assert_eq!(hanging, [("ego".to_owned(), "has said nothing for 5.1 s".to_owned())]);
+        assert_eq!(hanging, [("ego".to_owned(), "has not reported for 5.1 s".to_owned())]);
         health
             .note(&event("ego", ProcessEventKind::Fell { how: "hung".into(), again_after: SILENT, restart: 1 }), began);
         let status = health.statuses(began).remove(0);
@@ -281,23 +284,23 @@ mod tests {
     fn a_stopped_machine_is_no_reason_to_replace_everyone() {
         let (mut health, began) = watch();
         assert!(look(&mut health, began, [0, 2000, 1900]).is_empty());
-        // An hour later, before anyone has spoken.
+        // An hour later, before any report.
         assert!(look(&mut health, began, [3_600_000, 3_604_000, 1900]).is_empty());
         assert_eq!(look(&mut health, began, [3_605_000, 3_605_100, 1900]).len(), 1, "and then silent all the same");
     }
 
     #[test]
-    fn nobody_hangs_where_the_network_is_away() {
+    fn no_process_counts_as_hung_without_a_network() {
         let (mut health, began) = watch();
         assert!(look(&mut health, began, [0, 2000, 1900]).is_empty());
         let at = |ms| began + Duration::from_millis(ms);
-        let heard = BTreeMap::from([("ego".to_owned(), at(1900)), ("scorer".to_owned(), at(2000))]);
-        assert!((2100..30_000).step_by(100).all(|ms| health.look(&heard, at(ms)).is_empty()));
+        let last_reports = BTreeMap::from([("ego".to_owned(), at(1900)), ("scorer".to_owned(), at(2000))]);
+        assert!((2100..30_000).step_by(100).all(|ms| health.look(&last_reports, at(ms)).is_empty()));
         assert_eq!(health.statuses(at(30_000))[0].state, State::Silent);
     }
 
     #[test]
-    fn the_system_tells_what_a_process_uses() {
+    fn resources_of_a_process_are_read() {
         let usage = Usage::of(std::process::id()).unwrap();
         assert!(usage.resident_mib.unwrap() > 1.0 && usage.threads.unwrap() >= 1 && usage.descriptors.unwrap() >= 3);
         assert_eq!(Usage::of(u32::MAX), None);

@@ -2,10 +2,10 @@
 //!
 //! ```text
 //! KEYS/authority.key        signs further certificates; belongs on no vehicle
-//! KEYS/agent-4279/ca.pem    whom to trust
-//!                 cert.pem  who this is: the common name is that of the folder
-//!                 key.pem   the proof of it, readable for its owner alone
-//! KEYS/router/members       beside the router's own three: whom it lets in
+//! KEYS/agent-4279/ca.pem    certificate of the authority
+//!                 cert.pem  certificate of this process: its common name is the name of the folder
+//!                 key.pem   private key, readable for its owner only
+//! KEYS/router/members       in addition to the three files: the processes that the router admits
 //! ```
 //!
 //! A host gets the folders of its own processes and nothing else.
@@ -24,68 +24,68 @@ use rcgen::{
     KeyUsagePurpose, SanType, date_time_ymd,
 };
 
-/// The key of the authority.
+/// File name of the authority's key.
 pub const AUTHORITY_KEY: &str = "authority.key";
 const AUTHORITY_NAME: &str = "v2vloc test authority";
 const DAY: Duration = Duration::from_secs(24 * 3600);
 /// Certificates hold from a little before they are made: clocks differ.
 const LEEWAY: Duration = Duration::from_secs(600);
 
-/// What to make.
+/// Plan of the keys to make.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct KeyPlan {
-    /// Where; an authority that is there already signs.
+    /// Folder; an existing authority in it signs.
     pub folder: PathBuf,
-    /// For whom, beside the router.
-    pub parties: Vec<Principal>,
-    /// Names and addresses under which the router is reached.
+    /// Processes that get keys, in addition to the router.
+    pub principals: Vec<Principal>,
+    /// Names and addresses of the router.
     pub hosts: Vec<String>,
-    /// How long the certificates hold.
+    /// Lifetime of the certificates.
     pub lifetime: Duration,
-    /// Whether certificates that are there are replaced.
+    /// True if existing certificates are replaced.
     pub replace: bool,
 }
 
 impl KeyPlan {
-    /// Certificates for `parties` of a fleet on this machine, for `days` days.
+    /// Certificates for `principals` of a fleet on this machine, valid for `days` days.
     #[must_use]
-    pub fn new(folder: &Path, parties: Vec<Principal>, days: u32) -> Self {
+    pub fn new(folder: &Path, principals: Vec<Principal>, days: u32) -> Self {
         let hosts = ["localhost", "127.0.0.1", "::1"].map(str::to_owned).into();
-        Self { folder: folder.to_path_buf(), parties, hosts, lifetime: DAY * days, replace: false }
+        Self { folder: folder.to_path_buf(), principals, hosts, lifetime: DAY * days, replace: false }
     }
 }
 
-/// Why there are no keys.
+/// Reason why no keys could be made.
 #[derive(Debug, thiserror::Error)]
 pub enum KeyError {
-    /// The disk refuses.
+    /// The file system refuses.
     #[error("{}: {cause}", path.display())]
     Io {
-        /// Which file or folder.
+        /// File or folder.
         path: PathBuf,
-        /// The system's words.
+        /// Error of the operating system.
         cause: io::Error,
     },
-    /// Nothing is overwritten unasked.
-    #[error("{} is there already; --force makes it anew, and whoever holds the old one keeps it until it expires", .0.display())]
+    /// Existing keys are not overwritten without `--force`.
+    #[error("{} is there already; --force replaces it; the old one stays valid until it expires", .0.display())]
     There(PathBuf),
-    /// A name of a host, or a key, that cannot be used.
+    /// A host name or a key that cannot be used.
     #[error("{what}: {cause}")]
     Unusable {
-        /// What.
+        /// Host name or file.
         what: String,
-        /// Why.
+        /// Error of the certificate library.
         cause: rcgen::Error,
     },
 }
 
-/// Makes what the plan asks for, and tells every file it wrote.
+/// Makes the keys of the plan; returns every file that it wrote.
 ///
 /// # Errors
 /// [`KeyError`]; files that were written before it stay.
 pub fn make(plan: &KeyPlan) -> Result<Vec<PathBuf>, KeyError> {
     let mut desk = KeyStore { plan, written: Vec::new() };
-    let folders = plan.parties.iter().map(ToString::to_string).chain([ROUTER.to_owned()]);
+    let folders = plan.principals.iter().map(ToString::to_string).chain([ROUTER.to_owned()]);
     let folders: Vec<(String, PathBuf)> = folders.map(|name| (name.clone(), plan.folder.join(name))).collect();
     let router_is_there = plan.folder.join(ROUTER).join(CERTIFICATE_FILE).exists();
     let is_wanted = |name: &str| name != ROUTER || !router_is_there || plan.replace;
@@ -103,7 +103,7 @@ pub fn make(plan: &KeyPlan) -> Result<Vec<PathBuf>, KeyError> {
     Ok(desk.written)
 }
 
-/// The authority: its certificate as text, and what signs.
+/// The authority: its certificate as text, and its signer.
 struct Authority {
     pem: String,
     issuer: Issuer<'static, KeyPair>,
@@ -115,13 +115,13 @@ struct KeyStore<'a> {
 }
 
 impl KeyStore<'_> {
-    /// Takes the authority of the folder, or founds one.
+    /// Loads the authority of the folder, or creates one.
     fn authority(&mut self) -> Result<Authority, KeyError> {
         let folder = &self.plan.folder;
         make_folder(folder)?;
         let (key_path, pem_path) = (folder.join(AUTHORITY_KEY), folder.join(AUTHORITY_FILE));
         let unusable = |cause| KeyError::Unusable { what: key_path.display().to_string(), cause };
-        // One that is there goes on for as long as the certificates that it signs.
+        // An existing one stays valid for as long as the certificates that it signs.
         let params = authority_params(self.plan.lifetime.max(DAY * 3650))?;
         if key_path.exists() {
             let key = KeyPair::from_pem(&read(&key_path)?).map_err(unusable)?;
@@ -139,7 +139,7 @@ impl KeyStore<'_> {
         let mut params = params(name, self.plan.lifetime)?;
         params.use_authority_key_identifier_extension = true;
         params.key_usages = vec![KeyUsagePurpose::DigitalSignature];
-        // Any process can be the router of its run (--listen); only the one of that name is asked by its address.
+        // Any process can be the router of its run (--listen); only the one of that name is addressed by host name.
         params.extended_key_usages = vec![ExtendedKeyUsagePurpose::ClientAuth];
         if name == ROUTER {
             params.extended_key_usages.push(ExtendedKeyUsagePurpose::ServerAuth);
@@ -151,11 +151,11 @@ impl KeyStore<'_> {
         make_folder(folder)?;
         self.write(folder.join(AUTHORITY_FILE), &authority.pem, 0o644)?;
         self.write(folder.join(KEY_FILE), &key.serialize_pem(), 0o600)?;
-        // Last: where it is, the rest is.
+        // Written last: if it exists, the other files do.
         self.write(folder.join(CERTIFICATE_FILE), &certificate.pem(), 0o644)
     }
 
-    /// Tells the router of everybody in the folder, also of those who were there before.
+    /// Writes the router's list of every process in the folder, including earlier ones.
     fn enlist(&mut self) -> Result<(), KeyError> {
         let folder = &self.plan.folder;
         let io = |cause| KeyError::Io { path: folder.clone(), cause };
@@ -171,7 +171,7 @@ impl KeyStore<'_> {
         self.write(folder.join(ROUTER).join(MEMBERS_FILE), &members.concat(), 0o644)
     }
 
-    /// Never leaves half a file, nor a moment in which others can read a key.
+    /// Atomic write: leaves neither half a file nor a moment in which others can read a key.
     fn write(&mut self, path: PathBuf, text: &str, mode: u32) -> Result<(), KeyError> {
         let io = |cause| KeyError::Io { path: path.clone(), cause };
         let begun = path.with_extension("new");
@@ -229,14 +229,14 @@ mod tests {
 
     use super::*;
 
-    fn parties(names: &[&str]) -> Vec<Principal> {
+    fn principals(names: &[&str]) -> Vec<Principal> {
         names.iter().map(|name| name.parse().unwrap()).collect()
     }
 
     #[test]
     fn everybody_gets_a_certificate_and_a_key_of_his_own() {
         let folder = tempfile::tempdir().unwrap();
-        let plan = KeyPlan::new(&folder.path().join("keys"), parties(&["agent-1", "replay"]), 1);
+        let plan = KeyPlan::new(&folder.path().join("keys"), principals(&["agent-1", "replay"]), 1);
         let written = make(&plan).unwrap();
         assert_eq!(written.len(), 2 + 3 * 3 + 1, "{written:?}");
         for name in ["agent-1", "replay", "router"] {
@@ -248,19 +248,19 @@ mod tests {
         }
         assert_eq!(fs::metadata(plan.folder.join(AUTHORITY_KEY)).unwrap().permissions().mode() & 0o777, 0o600);
         let members = Credentials::read(&plan.folder.join("router")).unwrap().members().unwrap();
-        assert_eq!(members, parties(&["agent-1", "replay"]));
+        assert_eq!(members, principals(&["agent-1", "replay"]));
     }
 
     #[test]
-    fn what_is_there_stays_unless_asked() {
+    fn existing_keys_stay_without_force() {
         let folder = tempfile::tempdir().unwrap();
-        let plan = KeyPlan::new(folder.path(), parties(&["agent-1"]), 1);
+        let plan = KeyPlan::new(folder.path(), principals(&["agent-1"]), 1);
         make(&plan).unwrap();
         let read = |name: &str| fs::read(folder.path().join(name).join(CERTIFICATE_FILE)).unwrap();
         let (agent, router) = (read("agent-1"), read("router"));
         assert!(matches!(make(&plan), Err(KeyError::There(_))));
-        // A vehicle that comes later is signed by the same authority.
-        make(&KeyPlan { parties: parties(&["agent-2"]), ..plan.clone() }).unwrap();
+        // A vehicle that is added later is signed by the same authority.
+        make(&KeyPlan { principals: principals(&["agent-2"]), ..plan.clone() }).unwrap();
         assert_eq!((read("agent-1"), read("router")), (agent.clone(), router));
         let members = fs::read_to_string(folder.path().join("router/members")).unwrap();
         assert_eq!(members, "agent-1\nagent-2\n");
@@ -271,7 +271,7 @@ mod tests {
     #[test]
     fn an_expired_certificate_is_named() {
         let folder = tempfile::tempdir().unwrap();
-        let plan = KeyPlan { lifetime: Duration::ZERO, ..KeyPlan::new(folder.path(), parties(&["agent-1"]), 1) };
+        let plan = KeyPlan { lifetime: Duration::ZERO, ..KeyPlan::new(folder.path(), principals(&["agent-1"]), 1) };
         make(&plan).unwrap();
         std::thread::sleep(Duration::from_millis(1100));
         let error = Credentials::read(&folder.path().join("agent-1")).unwrap_err().to_string();

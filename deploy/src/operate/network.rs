@@ -1,4 +1,4 @@
-//! Where the processes of a run meet: a router inside this process, or one that runs elsewhere.
+//! Router endpoint of a run: a router inside this process, or one that runs elsewhere.
 
 use std::net::{SocketAddr, TcpListener, UdpSocket};
 use std::time::Duration;
@@ -9,22 +9,22 @@ use zenoh::{Session, Wait};
 
 use protocol::{Principal, ProcessId, Role, RunId};
 
-use crate::experiment::score::scorer_cav;
-use crate::operate::run_fleet::UpError;
+use crate::operate::RunError;
 use crate::operate::security::RunKeys;
 use crate::operate::supervise::ProcessSpec;
 use crate::scenario::Network;
+use crate::score::scorer_cav;
 
-/// How long closing the session may take.
+/// Longest time for closing the session.
 const CLOSE_LIMIT: Duration = Duration::from_millis(500);
 
 /// An open session, and the endpoint that the other processes connect to.
 pub struct RouterEndpoint {
     /// The session of this process.
     pub session: Session,
-    /// What to tell the others.
+    /// Endpoint that the other processes are given.
     pub endpoint: Endpoint,
-    /// Whether the router is this process and refuses what is not allowed.
+    /// True if the router is in this process and enforces access control.
     pub is_guarded: bool,
 }
 
@@ -32,7 +32,7 @@ impl RouterEndpoint {
     /// Opens the router of this run, or connects to the one that the scenario names; with keys over QUIC.
     ///
     /// # Errors
-    /// [`BusError`] when the port is in use, nothing answers there, the endpoint is none or the keys are not right.
+    /// [`BusError`] when the port is in use, no router answers, the endpoint is invalid or the keys do not fit.
     pub fn open(network: &Network, run: &RunId, keys: Option<&RunKeys>) -> Result<Self, BusError> {
         let options = match &network.connect {
             Some(router) => {
@@ -51,11 +51,11 @@ impl RouterEndpoint {
         Ok(Self { session, endpoint: from_here(options.endpoint())?, is_guarded: options.guard.is_some() })
     }
 
-    /// Checks that none of the processes to start, nor a scorer, is there already, on a router that others use too.
+    /// Checks that none of the processes to start, nor a scorer, is already present on a shared router.
     ///
     /// # Errors
-    /// [`UpError::Live`] names those that are; [`UpError::Network`] when the router does not say.
-    pub fn check_free(&self, network: &Network, run: &RunId, specs: &[ProcessSpec]) -> Result<(), UpError> {
+    /// [`RunError::Live`] names those present; [`RunError::Network`] when the router does not answer.
+    pub fn check_free(&self, network: &Network, run: &RunId, specs: &[ProcessSpec]) -> Result<(), RunError> {
         if network.connect.is_none() {
             return Ok(());
         }
@@ -66,13 +66,13 @@ impl RouterEndpoint {
         if processes.is_empty() {
             return Ok(());
         }
-        Err(UpError::Live { run: run.clone(), router: self.endpoint.to_string(), processes })
+        Err(RunError::Live { run: run.clone(), router: self.endpoint.to_string(), processes })
     }
 
     /// Closes the session.
     ///
     /// # Errors
-    /// [`Overdue`] when the network does not let go.
+    /// [`Overdue`] when the session does not close in time.
     pub fn close(self) -> Result<(), Overdue> {
         shutdown::within(CLOSE_LIMIT, "the router", move || {
             if let Err(cause) = self.session.close().wait() {
@@ -82,18 +82,18 @@ impl RouterEndpoint {
     }
 }
 
-/// The endpoint as processes of this host reach it: who listens everywhere is met on the loopback, whose name certificates
-/// carry.
+/// Endpoint as processes of this host reach it: an unspecified listening address becomes the loopback, whose name
+/// certificates carry.
 fn from_here(endpoint: &Endpoint) -> Result<Endpoint, BusError> {
     let text = endpoint.as_str().replacen("/0.0.0.0:", "/127.0.0.1:", 1);
     Endpoint::new(&text.replacen("/[::]:", "/[::1]:", 1))
 }
 
-/// The endpoint with port 0 replaced by a port that is free right now.
+/// The endpoint with port 0 replaced by a port that is free at this moment.
 fn with_port(listen: &str, secured: bool) -> Result<Endpoint, BusError> {
     let Some(place) = listen.strip_suffix(":0") else { return Endpoint::new(listen) };
     let host = place.split_once('/').map_or(place, |(_, host)| host);
-    // Asking the system beats guessing; should another program take the port in between, the router says so.
+    // If another program takes the port in between, the router reports the error.
     let bound = if secured {
         UdpSocket::bind(format!("{host}:0")).and_then(|socket| socket.local_addr())
     } else {
@@ -116,7 +116,7 @@ mod tests {
     }
 
     #[test]
-    fn who_listens_everywhere_is_met_on_the_loopback() {
+    fn an_unspecified_address_becomes_the_loopback() {
         for (listen, met) in [
             ("quic/0.0.0.0:7447", "quic/127.0.0.1:7447"),
             ("tcp/[::]:7447", "tcp/[::1]:7447"),

@@ -1,4 +1,4 @@
-//! `runs/<name>/`: everything that is kept of a run.
+//! `runs/<name>/`: files of a run.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -9,29 +9,29 @@ use protocol::RunId;
 use serde::Serialize;
 use support::csv_file::CsvText;
 
-use crate::experiment::score::{FrameRecord, StageStamps};
+use crate::score::{FrameRecord, StageStamps};
 
-/// Why a run folder cannot be used.
+/// Reason why a run folder cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum RunFolderError {
-    /// Another run of that name is kept there.
+    /// A run of that name has a folder already.
     #[error("{} exists already: choose another --name, or remove it", .0.display())]
-    Pop(PathBuf),
+    Taken(PathBuf),
     /// A file or folder cannot be written.
     #[error("cannot write {}: {source}", path.display())]
     Write {
-        /// Which.
+        /// File or folder.
         path: PathBuf,
-        /// Why.
+        /// Error of the operating system.
         source: std::io::Error,
     },
 }
 
 /// The recording of a run.
 pub const RECORDING: &str = "recording.mcap";
-/// Where the ego's agent notes when each sweep came.
+/// Arrival times of the sweeps at the ego's agent.
 pub const SWEEP_LOG: &str = "sweeps.csv";
-/// Where the replay notes how far it is, for one that falls and is started again.
+/// Checkpoint of the replay, from which a restarted one resumes.
 pub const BOOKMARK: &str = "replay.json";
 
 /// The folder of one run.
@@ -49,9 +49,9 @@ impl RunFolder {
         let runs = std::path::absolute(runs).unwrap_or_else(|_| runs.into());
         let path = runs.join(name.as_str());
         fs::create_dir_all(&runs).map_err(|source| RunFolderError::Write { path: runs.clone(), source })?;
-        // One call that fails if it is there, so that two runs never share a folder.
+        // One call that fails if the folder exists, so that two runs never share a folder.
         match fs::create_dir(&path) {
-            Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => return Err(RunFolderError::Pop(path)),
+            Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => return Err(RunFolderError::Taken(path)),
             other => other.map_err(|source| RunFolderError::Write { path: path.clone(), source })?,
         }
         let log = path.join("log");
@@ -59,26 +59,26 @@ impl RunFolder {
         Ok(Self { path })
     }
 
-    /// Removes it with all that is in it: of a run that was refused before it began, so that its name is free again.
+    /// Removes it with all its files: for a run that was refused before it began, so that its name is free again.
     pub fn remove(self) {
         if let Err(error) = fs::remove_dir_all(&self.path) {
             tracing::warn!("cannot remove {}, the folder of a run that did not begin: {error}", self.path.display());
         }
     }
 
-    /// Where it is.
+    /// Path of the folder.
     #[must_use]
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Where the processes' logs are.
+    /// Folder of the processes' logs.
     #[must_use]
     pub fn log_dir(&self) -> PathBuf {
         self.path.join("log")
     }
 
-    /// The path of a file in it.
+    /// Path of a file in the folder.
     #[must_use]
     pub fn file(&self, name: &str) -> PathBuf {
         self.path.join(name)
@@ -91,13 +91,13 @@ impl RunFolder {
     pub fn write(&self, name: &str, text: &str) -> Result<(), RunFolderError> {
         let path = self.file(name);
         fs::write(&path, text).map_err(|source| {
-            // Half a file is worse than none.
+            // A partial file is worse than none.
             let _ = fs::remove_file(&path);
             RunFolderError::Write { path, source }
         })
     }
 
-    /// Writes the configuration of a process to `config/<process>.yaml`; its path.
+    /// Writes the configuration of a process to `config/<process>.yaml`; returns its path.
     ///
     /// # Errors
     /// [`RunFolderError::Write`].
@@ -122,7 +122,8 @@ impl RunFolder {
         self.write(name, &(text + "\n"))
     }
 
-    /// Writes `frames.csv`; `swept` says when the sweep of each capture time reached the ego's agent, Unix nanoseconds.
+    /// Writes `frames.csv`; `swept` holds the arrival time of each sweep at the ego's agent, by capture time, Unix
+    /// nanoseconds.
     ///
     /// # Errors
     /// [`RunFolderError::Write`].
@@ -172,7 +173,7 @@ fn frame_fields(record: &FrameRecord, swept: &BTreeMap<u64, u64>) -> Vec<String>
     fields
 }
 
-/// A name for a run that has none: `prefix` and the time, UTC, for example `up-20260131-235959`.
+/// Name for an unnamed run: `prefix` and the time, UTC, for example `up-20260131-235959`.
 ///
 /// # Panics
 /// Never with a `prefix` of an identifier's characters, at most 16.
@@ -252,7 +253,7 @@ mod tests {
 
     #[test]
     fn time_stamps_are_dates() {
-        // Pop from `date -u -d @... +%Y%m%d-%H%M%S`.
+        // Output of `date -u -d @... +%Y%m%d-%H%M%S`.
         for (secs, text) in [
             (0, "19700101-000000"),
             (951_782_400, "20000229-000000"),

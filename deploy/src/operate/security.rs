@@ -1,4 +1,4 @@
-//! The keys of one run: those of a folder, or some made for it alone.
+//! Keys of one run: those of a folder, or generated for this run only.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -14,28 +14,28 @@ use crate::operate::keys::{self, KeyError, KeyPlan};
 use crate::operate::network::RouterEndpoint;
 use crate::scenario::Security;
 
-/// Days for which the keys of one run hold.
+/// Lifetime of the keys of one run, days.
 const DAYS_OF_A_RUN: u32 = 30;
 
-/// Where every process of a run finds its keys.
+/// Folder with the keys of every process of a run.
 #[derive(Debug)]
 pub struct RunKeys {
     folder: PathBuf,
-    /// Made for this run, and gone with it.
+    /// Generated for this run, and deleted with it.
     is_own: bool,
 }
 
 impl RunKeys {
-    /// Takes the folder that the scenario names, or makes keys for `parties` in `run_folder`.
+    /// Uses the folder that the scenario names, or generates keys for `principals` in `run_folder`.
     ///
     /// # Errors
     /// [`KeyError`] when they cannot be made.
-    pub fn of(security: &Security, parties: Vec<Principal>, run_folder: &Path) -> Result<Self, KeyError> {
+    pub fn of(security: &Security, principals: Vec<Principal>, run_folder: &Path) -> Result<Self, KeyError> {
         if let Some(folder) = &security.keys {
             return Ok(Self { folder: folder.clone(), is_own: false });
         }
         let own = Self { folder: run_folder.join("keys"), is_own: true };
-        keys::make(&KeyPlan::new(&own.folder, parties, DAYS_OF_A_RUN))?;
+        keys::make(&KeyPlan::new(&own.folder, principals, DAYS_OF_A_RUN))?;
         Ok(own)
     }
 
@@ -45,10 +45,10 @@ impl RunKeys {
         self.folder.join(name)
     }
 
-    /// A router with these keys that lets everyone in who has some, into `run`.
+    /// A router with these keys that admits every process with a certificate, into `run` only.
     ///
     /// # Errors
-    /// [`BusError::Keys`] names what is wrong with them.
+    /// [`BusError::Keys`] names the problem.
     pub fn for_router(&self, options: BusOptions, run: &RunId) -> Result<BusOptions, BusError> {
         let credentials = self.read(ROUTER)?;
         let guard = AccessControl { members: credentials.members()?, runs: RunScope::One(run.clone()) };
@@ -58,7 +58,7 @@ impl RunKeys {
     /// A client with the keys of the process of that name.
     ///
     /// # Errors
-    /// [`BusError::Keys`] names what is wrong with them.
+    /// [`BusError::Keys`] names the problem.
     pub fn for_client(&self, options: BusOptions, name: &str) -> Result<BusOptions, BusError> {
         Ok(options.with_credentials(self.read(name)?))
     }
@@ -75,15 +75,15 @@ impl Drop for RunKeys {
         if self.is_own
             && let Err(error) = fs::remove_dir_all(&self.folder)
         {
-            tracing::warn!("{} holds keys that nobody needs any more: {error}", self.folder.display());
+            tracing::warn!("{} holds keys that are no longer needed: {error}", self.folder.display());
         }
     }
 }
 
-/// How often the router of a run is asked what it has refused.
+/// Interval at which the refusals of a run's router are read.
 const LOOK_ROUND: Duration = Duration::from_secs(1);
 
-/// Follows what the router of a run refuses.
+/// Reads the refusals of a run's router.
 pub(crate) struct RefusalWatch {
     stop: Stop,
     thread: Option<JoinHandle<RejectionLog>>,
@@ -115,7 +115,7 @@ impl RefusalWatch {
         Ok(Self { stop, thread: Some(thread) })
     }
 
-    /// All it has refused; said in the log too.
+    /// All refusals, which are also logged.
     pub(crate) fn finish(mut self) -> BTreeMap<Rejection, u64> {
         self.stop.request();
         let counts =

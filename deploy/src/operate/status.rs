@@ -1,4 +1,4 @@
-//! `status.json` in the folder of a run: how it goes, written while it goes and for the last time when it has ended.
+//! `status.json` in the folder of a run: its state, written during the run and for the last time at its end.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -9,88 +9,88 @@ use serde::{Deserialize, Serialize};
 use support::atomic_file;
 use support::text_table::{Side, TextTable};
 
-use crate::experiment::score::Progress;
 use crate::operate::health::{ProcessStatus, State, Usage};
+use crate::score::Progress;
 
-/// Name of the file.
+/// File name.
 pub const FILE: &str = "status.json";
-/// How often it is written.
+/// Interval between two writes.
 const PERIOD: Duration = Duration::from_millis(500);
-/// A run whose status is older than this is not watched by anyone any more.
+/// Age of a status beyond which the run counts as unsupervised.
 const STALE: Duration = Duration::from_secs(3);
 
-/// How a run goes.
+/// Status of a run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct RunStatus {
-    /// Its name.
+    /// Name of the run.
     pub run: String,
-    /// Whether it goes on.
+    /// Phase of the run.
     pub phase: Phase,
-    /// Process id of the `v2vloc up` that watches over it.
+    /// Process id of the `v2vloc up` that supervises it.
     pub pid: u32,
-    /// Where its processes meet.
+    /// Endpoint of its router.
     pub endpoint: String,
-    /// When this was written, milliseconds on the Unix clock.
+    /// Time of writing, milliseconds on the Unix clock.
     pub written_unix_ms: u64,
-    /// Since it began, seconds.
+    /// Time since its start, seconds.
     pub seconds: f64,
-    /// Results of the ego so far.
+    /// Number of results of the ego so far.
     pub frames: u64,
-    /// Since the last of them, seconds.
+    /// Time since the last result, seconds.
     pub last_result_s: Option<f64>,
-    /// From a tick to its result, milliseconds, of the last one.
+    /// Time from a tick to its result, milliseconds, of the last result.
     pub latency_ms: Option<f64>,
-    /// Neighbours in the last result.
+    /// Number of neighbours in the last result.
     pub fused: usize,
-    /// What the ego makes of those it heard for it.
+    /// Neighbours whose messages the ego received for the last result, and its judgement of each.
     #[serde(default)]
     pub neighbours: Vec<HeardNeighbour>,
-    /// Messages dropped so far, by all processes.
+    /// Number of messages dropped so far, by all processes.
     pub dropped: u64,
-    /// Its processes.
+    /// Status of each process.
     pub processes: Vec<ProcessStatus>,
 }
 
-/// Where a run stands.
+/// Phase of a run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Phase {
-    /// It goes on.
+    /// The run goes on.
     Running,
     /// Its processes are being ended.
     Ending,
-    /// It is over.
+    /// The run is over.
     Over,
-    /// Whoever watched over it is gone without a word.
+    /// The supervisor has ended without a final status.
     Lost,
 }
 
-/// Why there is no status.
+/// Reason why there is no status.
 #[derive(Debug, thiserror::Error)]
 pub enum StatusError {
     /// The file cannot be read.
     #[error("{}: {source}; is it the folder of a run that `v2vloc up` has started?", path.display())]
     Read {
-        /// Which.
+        /// Path of the file.
         path: PathBuf,
-        /// Why.
+        /// Error of the operating system.
         source: std::io::Error,
     },
-    /// It is not one.
+    /// The file is no status.
     #[error("{}: {problem}", path.display())]
     Syntax {
-        /// Which.
+        /// Path of the file.
         path: PathBuf,
-        /// What is wrong.
+        /// Description of the error.
         problem: String,
     },
-    /// There is no run at all.
+    /// No run in the folder.
     #[error("there is no run in {}", .0.display())]
     NoRun(PathBuf),
 }
 
 impl RunStatus {
-    /// Reads the status in the folder of a run, and sees whether someone still watches over it.
+    /// Reads the status in the folder of a run, and checks whether its supervisor still runs.
     ///
     /// # Errors
     /// [`StatusError`] names the file.
@@ -103,10 +103,10 @@ impl RunStatus {
         Ok(if is_lost { Self { phase: Phase::Lost, ..status } } else { status })
     }
 
-    /// The folder of the run in `runs` that told about itself last.
+    /// Folder of the run in `runs` with the newest status.
     ///
     /// # Errors
-    /// [`StatusError::NoRun`] when none does.
+    /// [`StatusError::NoRun`] when no run has one.
     pub fn newest(runs: &Path) -> Result<PathBuf, StatusError> {
         let folders = fs::read_dir(runs).into_iter().flatten().flatten().map(|entry| entry.path());
         let written = |folder: &PathBuf| fs::metadata(folder.join(FILE)).and_then(|file| file.modified()).ok();
@@ -114,7 +114,7 @@ impl RunStatus {
         newest.ok_or_else(|| StatusError::NoRun(runs.to_owned()))
     }
 
-    /// What is wrong, in words: with whom while it goes on, who failed or stays down when it is over.
+    /// Problems as text: of processes during the run; of failed or crashed ones when it is over.
     #[must_use]
     pub fn troubles(&self) -> Vec<String> {
         let is_well = |process: &&ProcessStatus| match self.phase {
@@ -123,27 +123,27 @@ impl RunStatus {
             Phase::Lost => true,
         };
         let sick = self.processes.iter().filter(|process| !is_well(process) || process.failure.is_some());
-        let in_words = |process: &ProcessStatus| {
+        let describe = |process: &ProcessStatus| {
             let why = process.failure.as_ref().or(process.last_fall.as_ref());
             let state = name_of(&process.state);
             format!("{} is {state}{}", process.name, why.map_or(String::new(), |why| format!(" ({why})")))
         };
-        let lost = (self.phase == Phase::Lost).then(|| "whoever watched over it is gone".to_owned());
-        lost.into_iter().chain(sick.map(in_words)).collect()
+        let lost = (self.phase == Phase::Lost).then(|| "the supervisor has ended".to_owned());
+        lost.into_iter().chain(sick.map(describe)).collect()
     }
 
-    /// Whether nothing is wrong.
+    /// True if there is no problem.
     #[must_use]
     pub fn is_well(&self) -> bool {
         self.troubles().is_empty()
     }
 
-    /// Since it was written.
+    /// Time since it was written.
     fn age(&self) -> Duration {
         Duration::from_millis(unix_ms().saturating_sub(self.written_unix_ms))
     }
 
-    /// For people.
+    /// The status as text for a terminal.
     #[must_use]
     pub fn table(&self) -> String {
         let mut text = format!(
@@ -167,7 +167,7 @@ impl RunStatus {
     fn processes_table(&self) -> TextTable {
         let left = ["process", "state"].map(|name| (name, Side::Left));
         let right = ["pid", "up s", "restarts", "silent s", "MiB", "fds"].map(|name| (name, Side::Right));
-        let mut table = TextTable::new(left.into_iter().chain(right).chain([("last fall or failure", Side::Left)]));
+        let mut table = TextTable::new(left.into_iter().chain(right).chain([("last crash or failure", Side::Left)]));
         for process in &self.processes {
             table.row([
                 process.name.clone(),
@@ -205,12 +205,12 @@ fn optional(value: Option<f64>, digits: usize) -> String {
     value.map_or("-".into(), |value| format!("{value:.digits$}"))
 }
 
-/// A name as in the file.
+/// Name of a value as in the file.
 fn name_of(value: &impl Serialize) -> String {
     serde_json::to_value(value).ok().and_then(|value| value.as_str().map(str::to_owned)).unwrap_or_default()
 }
 
-/// Writes the status of a run from time to time.
+/// Writes the status of a run periodically.
 #[derive(Debug)]
 pub struct StatusWriter {
     path: PathBuf,
@@ -218,12 +218,12 @@ pub struct StatusWriter {
     endpoint: String,
     began: Instant,
     written: Option<Instant>,
-    /// A disk that is full is complained of once.
-    complained: bool,
+    /// A full disk is reported once.
+    has_warned: bool,
 }
 
 impl StatusWriter {
-    /// For the run in `folder`, which meets at `endpoint`.
+    /// For the run in `folder`, with its router at `endpoint`.
     #[must_use]
     pub fn new(folder: &Path, run: &str, endpoint: &str) -> Self {
         Self {
@@ -232,11 +232,11 @@ impl StatusWriter {
             endpoint: endpoint.to_owned(),
             began: Instant::now(),
             written: None,
-            complained: false,
+            has_warned: false,
         }
     }
 
-    /// Writes the status if it is time to, or `phase` is another than before and has to be told.
+    /// Writes the status if it is due, or if `phase` has changed.
     pub fn write(&mut self, phase: Phase, progress: &Progress, processes: impl FnOnce(Instant) -> Vec<ProcessStatus>) {
         let now = Instant::now();
         if phase == Phase::Running && self.written.is_some_and(|written| now.duration_since(written) < PERIOD) {
@@ -259,10 +259,10 @@ impl StatusWriter {
             processes: processes(now),
         };
         match atomic_file::write(&self.path, serde_json::to_string_pretty(&status).unwrap_or_default()) {
-            Ok(()) => self.complained = false,
-            Err(error) if !self.complained => {
-                self.complained = true;
-                tracing::warn!("{}: {error}; `v2vloc status` will not know", self.path.display());
+            Ok(()) => self.has_warned = false,
+            Err(error) if !self.has_warned => {
+                self.has_warned = true;
+                tracing::warn!("{}: {error}; `v2vloc status` will show an old state", self.path.display());
             }
             Err(_) => {}
         }
@@ -295,33 +295,33 @@ mod tests {
     }
 
     #[test]
-    fn what_is_written_reads_back_and_a_dead_watcher_is_noticed() {
+    fn a_status_reads_back_and_an_ended_supervisor_is_detected() {
         let folder = tempfile::tempdir().unwrap();
         let run = folder.path().join("test");
         fs::create_dir(&run).unwrap();
         assert!(matches!(RunStatus::newest(folder.path()), Err(StatusError::NoRun(_))));
         assert!(RunStatus::read(&run).unwrap_err().to_string().contains("status.json"));
         let mut writer = StatusWriter::new(&run, "test", "tcp/127.0.0.1:7447");
-        let liar = HeardNeighbour {
+        let attacker = HeardNeighbour {
             cav: protocol::CavId::new("4279").unwrap(),
             trust: Some(0.03),
             doubt: Some(protocol::MisbehaviourReason::GhostObjects),
             clock_offset_s: Some(0.0125),
         };
-        let progress = Progress { frames: 7, heard: vec![liar], ..Progress::default() };
+        let progress = Progress { frames: 7, heard: vec![attacker], ..Progress::default() };
         writer.write(Phase::Running, &progress, |_| vec![process(State::Ready)]);
-        // Not time yet.
+        // Not due yet.
         writer.write(Phase::Running, &Progress::default(), |_| Vec::new());
         let status = RunStatus::read(&RunStatus::newest(folder.path()).unwrap()).unwrap();
         assert_eq!((status.phase, status.frames, status.processes.len()), (Phase::Running, 7, 1));
         assert!(status.is_well());
         let table = status.table();
         assert!(table.starts_with("test running for 0 s at tcp/127.0.0.1:7447: 7 frames"), "{table}");
-        assert!(table.ends_with("4279           12.5   0.03  invented\n"), "{table}");
+        assert!(table.ends_with("4279           12.5   0.03  ghost_objects\n"), "{table}");
         assert!(table.contains("agent-4288") && table.contains("was ended by signal 9"), "{table}");
 
-        let dead = RunStatus { pid: u32::MAX, ..status.clone() };
-        fs::write(run.join(FILE), serde_json::to_string(&dead).unwrap()).unwrap();
+        let ended = RunStatus { pid: u32::MAX, ..status.clone() };
+        fs::write(run.join(FILE), serde_json::to_string(&ended).unwrap()).unwrap();
         let found = RunStatus::read(&run).unwrap();
         assert!(found.phase == Phase::Lost && !found.is_well());
         fs::write(run.join(FILE), "{").unwrap();
@@ -350,6 +350,6 @@ mod tests {
     fn a_disk_that_refuses_ends_nothing() {
         let mut writer = StatusWriter::new(Path::new("/nowhere"), "test", "tcp/127.0.0.1:7447");
         writer.write(Phase::Running, &Progress::default(), |_| Vec::new());
-        assert!(writer.complained);
+        assert!(writer.has_warned);
     }
 }

@@ -1,4 +1,4 @@
-//! The watch over a run while it goes: shows what happens, replaces who hangs, tells `v2vloc status`.
+//! Supervision of a run: displays events, replaces hung processes, writes the status for `v2vloc status`.
 
 use std::sync::mpsc::{Receiver, RecvTimeoutError};
 use std::time::{Duration, Instant};
@@ -7,29 +7,29 @@ use bus::Endpoint;
 use bus::shutdown::Stop;
 use protocol::RunId;
 
-use crate::experiment::progress::Display;
-use crate::experiment::score::{Progress, ScorerNode};
 use crate::operate::failures::Failures;
 use crate::operate::fleet::{Fleet, REPLAY};
 use crate::operate::health::Health;
+use crate::operate::progress::Display;
 use crate::operate::run_folder::RunFolder;
 use crate::operate::status::{Phase, StatusWriter};
 use crate::operate::supervise::{ProcessEvent, ProcessEventKind, Supervisor};
+use crate::score::{Progress, ScorerNode};
 
-/// How often the display is brought up to date, and conditions are looked at.
+/// Update interval of the display and of the checks.
 const BEAT: Duration = Duration::from_millis(100);
 
-/// How the watch over a run ended.
+/// Reason for the end of a run.
 pub(crate) enum Ending {
     /// The scene is over.
     Over,
-    /// Someone asked to end.
+    /// The user ended the run.
     Asked,
-    /// A process stays down.
+    /// A process crashed and is not restarted.
     Failed { process: String, how: String },
 }
 
-/// The watch over a run while it goes.
+/// Supervision of a run.
 pub(crate) struct StatusReporter {
     health: Health,
     failures: Failures,
@@ -47,32 +47,33 @@ impl StatusReporter {
         }
     }
 
-    /// Takes note of what happened; what is wrong with the process from now on, in words.
+    /// Records an event; returns the failure of the process from now on, as text.
     pub(crate) fn note(&mut self, event: &ProcessEvent) -> Option<String> {
         self.health.note(event, Instant::now());
-        let words = self.failures.note(event)?;
-        self.health.fails(&event.name, words);
-        Some(words.to_owned())
+        let failure = self.failures.note(event)?;
+        self.health.fails(&event.name, failure);
+        Some(failure.to_owned())
     }
 
-    /// What the run had to go on without, in words.
+    /// Failures that the run continued without, as text.
     pub(crate) fn failures(&self) -> Vec<String> {
         self.failures.in_words()
     }
 
-    /// Who has fallen, at least once.
+    /// Processes that crashed at least once.
     pub(crate) fn fallen(&self) -> Vec<String> {
         let statuses = self.health.statuses(Instant::now()).into_iter();
         statuses.filter(|process| process.last_fall.is_some()).map(|process| process.name).collect()
     }
 
-    /// Writes down where the run stands.
+    /// Writes the status of the run.
     pub(crate) fn tell(&mut self, phase: Phase, progress: &Progress) {
         let health = &self.health;
         self.status.write(phase, progress, |now| health.statuses(now));
     }
 
-    /// Shows what happens, and replaces who hangs, until the scene is over, someone asks to end, or a process stays down.
+    /// Displays events and replaces hung processes until the scene is over, the user ends the run, or a process stays
+    /// down.
     pub(crate) fn follow(
         &mut self,
         supervisor: &Supervisor,
@@ -95,11 +96,11 @@ impl StatusReporter {
             let event = match happened.recv_timeout(BEAT) {
                 Ok(event) => event,
                 Err(RecvTimeoutError::Timeout) => continue,
-                // Not before the supervisor is gone, which outlives this.
+                // Not before the supervisor has ended, which outlives this.
                 Err(RecvTimeoutError::Disconnected) => return Ending::Asked,
             };
-            if let Some(words) = self.note(&event) {
-                display.say(&format!("{}: {words}", event.name));
+            if let Some(failure) = self.note(&event) {
+                display.say(&format!("{}: {failure}", event.name));
             }
             if let Some(ending) = show(event, display) {
                 return ending;
@@ -108,7 +109,7 @@ impl StatusReporter {
     }
 }
 
-/// Shows what happened to a process; how the run ends where that ends it.
+/// Displays an event of a process; returns the end of the run where the event ends it.
 fn show(ProcessEvent { name, what }: ProcessEvent, display: &Display) -> Option<Ending> {
     match what {
         ProcessEventKind::Started { pid } => display.say(&format!("{name} runs (pid {pid})")),
@@ -117,7 +118,7 @@ fn show(ProcessEvent { name, what }: ProcessEvent, display: &Display) -> Option<
         ProcessEventKind::GaveUp { how, is_optional: false } => return Some(Ending::Failed { process: name, how }),
         // The replay is the clock of the run; the others follow it.
         ProcessEventKind::Done { .. } if name == REPLAY => return Some(Ending::Over),
-        // Told as failures, where they are some.
+        // Reported as failures, where they are some.
         ProcessEventKind::Said { .. }
         | ProcessEventKind::GaveUp { .. }
         | ProcessEventKind::Failed { .. }

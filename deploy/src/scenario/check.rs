@@ -12,7 +12,7 @@ impl Scenario {
     /// Checks the values of the fields and that what they name exists.
     ///
     /// # Errors
-    /// [`ScenarioError`] for the first field that makes no sense; `path` is named in it.
+    /// [`ScenarioError`] for the first invalid field, by path.
     pub fn check(&self, path: &Path) -> Result<(), ScenarioError> {
         self.check_values().map_err(|error| ConfigError::Value { path: Some(path.into()), error })?;
         self.check_files(path)
@@ -96,14 +96,14 @@ impl Scenario {
         }
         match &self.network.connect {
             Some(router) if self.clock == Clock::Stepped => {
-                let rule = "runs in virtual time are their own router when there is security";
+                let rule = "runs in simulation time are their own router when there is security";
                 Err(FieldError::new("network.connect", router, rule))
             }
             _ => Ok(()),
         }
     }
 
-    /// Checks that nothing contradicts the clock: virtual time knows no pace, no waiting and no other hosts.
+    /// Checks that no field contradicts the clock: simulation time has no pace, no waiting and no other hosts.
     fn check_clock(&self) -> Result<(), FieldError> {
         if self.clock == Clock::Wall {
             return match self.stepped {

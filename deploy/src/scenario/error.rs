@@ -4,20 +4,20 @@ use std::path::PathBuf;
 
 use bus::config_file::ConfigError;
 
-/// Why a scenario cannot be used.
+/// Reason why a scenario cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum ScenarioError {
     /// The file cannot be read, is no scenario, or has a value that is not allowed.
     #[error(transparent)]
     File(#[from] ConfigError),
-    /// A path names nothing.
+    /// A path does not exist.
     #[error("{}: {field}: {} does not exist", path.display(), missing.display())]
     Missing {
-        /// The scenario file.
+        /// Path of the scenario file.
         path: PathBuf,
         /// The field, with its parents.
         field: &'static str,
-        /// The file or folder that is not there.
+        /// The missing file or folder.
         missing: PathBuf,
     },
 }

@@ -1,4 +1,4 @@
-//! Reads scenario files: where a field is wrong, the message names file, line and field.
+//! Reader of scenario files: errors name file, line and field.
 
 use std::path::{Path, PathBuf};
 
@@ -7,7 +7,7 @@ use bus::config_file::{self, ConfigError};
 use super::{Scenario, ScenarioError};
 
 impl Scenario {
-    /// Reads and checks a scenario. Relative paths in it are taken from its folder and come back absolute.
+    /// Reads and checks a scenario. Relative paths are resolved against its folder.
     ///
     /// # Errors
     /// [`ScenarioError`] names the file, the line or field, and what is wrong.
@@ -26,7 +26,7 @@ impl Scenario {
         serde_saphyr::to_string(self).expect("plain structs, texts and numbers")
     }
 
-    /// Reads a scenario without checking it: for callers that fill in or replace some of it first.
+    /// Reads a scenario without checking it: for callers that first fill in or replace some fields.
     ///
     /// # Errors
     /// [`ScenarioError`] when the file cannot be read or is no scenario.
@@ -49,7 +49,7 @@ impl Scenario {
     }
 }
 
-/// The path with `.` and `a/..` taken out, so that messages and the resolved copy read well.
+/// The path without `.` and `a/..`, for readable messages and resolved copies.
 fn without_dots(path: &Path) -> PathBuf {
     use std::path::Component;
     let mut clean = PathBuf::new();
@@ -102,7 +102,7 @@ mod tests {
     }
 
     #[test]
-    fn what_maps_are_fitted_to_is_said_for_all_or_for_one() {
+    fn the_rate_of_feature_maps_is_set_for_all_or_for_one() {
         let text = format!(
             "{SMALL}agents: {{rate: {{bytes_per_second: 750000, watch_queue: true}}}}\nvehicles:\n  4288: {{rate: {{message_bytes: 75000}}}}\n"
         );
@@ -211,7 +211,7 @@ mod tests {
     }
 
     #[test]
-    fn the_samples_are_scenarios_and_say_what_the_defaults_are() {
+    fn the_samples_are_scenarios_and_state_the_defaults() {
         let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("scenarios");
         let entries = std::fs::read_dir(&folder).unwrap().map(|entry| entry.unwrap().path());
         let samples: Vec<_> = entries.filter(|path| path.extension().is_some_and(|kind| kind == "yaml")).collect();

@@ -1,13 +1,15 @@
-//! `SCENARIO.yaml`: one deployment, written down.
+//! `SCENARIO.yaml`: the description of one deployment.
 //!
-//! Its parts are the types that the processes read themselves, with a default per field, so that a scenario needs to name
-//! nothing but its scene and its weights. `deploy/scenarios/demo.yaml` shows every field with its default, and
+//! Its parts are the configuration types of the processes, with a default per field, so that a scenario needs only its
+//! scene and its weights. `deploy/scenarios/demo.yaml` shows every field with its default, and
 //! `deploy/scenarios/scenario.schema.json` describes them for editors.
 
 mod check;
 mod error;
+pub mod fingerprint;
 mod load;
 mod overrides;
+pub mod weights_choice;
 
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
@@ -27,9 +29,9 @@ use sim_replay::config::{LinkSelection, RecordingConfig, SceneConfig};
 pub use error::ScenarioError;
 pub use overrides::AgentOverrides;
 
-use crate::experiment::fingerprint::Provenance;
+use crate::scenario::fingerprint::Provenance;
 
-/// A deployment: which scene, which vehicles, which method, which network.
+/// A deployment: its scene, vehicles, method and network.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Scenario {
@@ -38,24 +40,26 @@ pub struct Scenario {
     pub run: Option<RunId>,
     /// The recording that drives the fleet; `dir` is relative to the scenario file.
     pub scene: SceneConfig,
-    /// Which clock the run keeps.
+    /// Clock of the run.
     #[serde(default)]
     pub clock: Clock,
-    /// What a run in virtual time is told; only with `clock: stepped`.
+    /// Settings of a run in simulation time; only with `clock: stepped`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub stepped: Option<Stepped>,
-    /// Whose messages and annotations count, and which objects. Agents and ego are chosen by `scene.agents` and `ego.id`.
+    /// Participating vehicles, counted annotations and objects. Agents and ego are chosen by `scene.agents` and
+    /// `ego.id`.
     #[serde(default, skip_serializing_if = "is_default_protocol")]
     pub protocol: ProtocolConfig,
-    /// Detector: weights, or a folder with a file `*-METHOD.safetensors` for each method, relative to the scenario file.
+    /// Detector: weights, or a folder with a file `*-METHOD.safetensors` for each method, relative to the scenario
+    /// file.
     pub models: ModelConfig,
-    /// How the ego fuses.
+    /// Fusion method of the ego.
     #[serde(default = "Scenario::default_method")]
     pub method: Method,
-    /// What every vehicle does unless `vehicles` says otherwise.
+    /// Settings of every vehicle, unless `vehicles` has others.
     #[serde(default)]
     pub agents: AgentSettings,
-    /// Settings of single vehicles, by id; a field given here wins over `agents`.
+    /// Settings of single vehicles, by id; a field given here takes precedence over `agents`.
     #[serde(default)]
     pub vehicles: BTreeMap<CavId, AgentOverrides>,
     /// Vehicles whose agents are started on other hosts; the run waits for them.
@@ -70,16 +74,16 @@ pub struct Scenario {
     /// Recording of all messages in `recording.mcap`. Absent: none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub record: Option<RecordingConfig>,
-    /// Where the processes meet.
+    /// Network of the processes.
     #[serde(default)]
     pub network: Network,
-    /// Whether the processes show certificates to each other; absent: they do not.
+    /// Certificates of the processes; absent: none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub security: Option<Security>,
-    /// How long to wait for what.
+    /// Timeouts.
     #[serde(default)]
     pub timeouts: Timeouts,
-    /// What a run was made of: written into the run folder, not read.
+    /// Provenance of a run: written into the run folder, not read.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub provenance: Option<Provenance>,
 }
@@ -88,26 +92,26 @@ fn is_default_protocol(protocol: &ProtocolConfig) -> bool {
     *protocol == ProtocolConfig::default()
 }
 
-/// Which clock a run keeps.
+/// Clock of a run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Clock {
-    /// Messages take the time they take.
+    /// Wall clock.
     #[default]
     Wall,
-    /// Virtual time: everyone computes as long as [`Stepped`] says, the emulated air decides what arrives when, and the
-    /// ego fuses exactly what has arrived `ego.deadline_ms` after a tick. Same scenario, same bytes.
+    /// Simulation time: every stage takes the compute time of [`Stepped`], the link emulation computes the arrival
+    /// times, and the ego fuses exactly what has arrived `ego.deadline_ms` after a tick. Same scenario, same bytes.
     Stepped,
 }
 
-/// What a run in virtual time is told.
+/// Settings of a run in simulation time.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Stepped {
-    /// How long everyone computes; absent: measured once, and written into the `scenario.yaml` of the run.
+    /// Compute times of the stages; absent: measured once, and written into the `scenario.yaml` of the run.
     pub compute: Option<ComputeTimes>,
-    /// Whether every agent is a process of its own, which gets its sweeps and sends what it sees over the network, all in
-    /// lockstep. Slower, and the same bytes.
+    /// True if every agent is a process of its own, which receives its sweeps and sends its feature maps over the
+    /// network, all in lockstep. Slower, and the same bytes.
     pub processes: bool,
 }
 
@@ -141,22 +145,22 @@ impl Scenario {
     }
 }
 
-/// Where the processes meet.
+/// Network of the processes.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Network {
-    /// Where the router inside this run listens; port 0 takes any free one.
+    /// Address at which the router inside this run listens; port 0 takes any free one.
     pub listen: String,
-    /// A router that runs already (`zenohd`), for example `tcp/10.0.0.1:7447`; no router is started then.
+    /// Router that runs already (`zenohd`), for example `tcp/10.0.0.1:7447`; no router is started then.
     pub connect: Option<String>,
     /// Shared memory for large messages between processes of one machine, MiB; 0: everything takes the socket.
     pub shared_memory_mib: usize,
-    /// How long the router inside this run may take to hand one message to one receiver, seconds, before it closes that
-    /// connection. Meanwhile it delivers nothing else of the same sender: a receiver behind a slow link needs more (8 MiB at
-    /// 13 Mbit/s take 5 s), and everybody else waits for it.
+    /// Longest time for handing one message to one receiver, seconds, after which the router inside this run closes
+    /// that connection. Meanwhile it delivers nothing else of the same sender: a receiver behind a slow link needs more
+    /// (8 MiB at 13 Mbit/s take 5 s), and all other receivers wait for it.
     pub stall_limit_s: f64,
-    /// Where the scorer serves its counters to Prometheus; the other processes take the ports behind it, in the order in
-    /// which they are started. Not served when absent.
+    /// Address at which the scorer serves its counters to Prometheus; the other processes take the ports after it, in
+    /// the order in which they are started. Not served when absent.
     pub metrics: Option<SocketAddr>,
 }
 
@@ -172,28 +176,29 @@ impl Default for Network {
     }
 }
 
-/// QUIC between all processes, and for each of them only what is its to say.
+/// QUIC between all processes; each is restricted to its own topics.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Security {
-    /// Folder that `v2vloc keys` has written, relative to the scenario file; absent: keys are made for this run alone.
+    /// Folder that `v2vloc keys` has written, relative to the scenario file; absent: keys are generated for this run
+    /// only.
     pub keys: Option<PathBuf>,
 }
 
-/// How long to wait for what.
+/// Timeouts.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Timeouts {
-    /// For every process to be ready before the first tick, seconds.
+    /// Until every process is ready before the first tick, seconds.
     pub ready_s: f64,
-    /// For the last detections after the last tick, seconds.
+    /// Until the last detections after the last tick, seconds.
     pub drain_s: f64,
-    /// For the processes to end before they are killed, seconds.
+    /// Until the processes have ended, before they are killed, seconds.
     pub stop_s: f64,
-    /// How often a process that keeps failing is started again.
+    /// Largest number of restarts of a process that keeps failing.
     pub restarts: u32,
-    /// For a process that has fallen silent to say something, before it is killed and started again, seconds. One whose work
-    /// stands still falls silent too: longer than the slowest frame takes.
+    /// Longest silence of a process before it is killed and restarted, seconds. A process whose worker is stalled is
+    /// silent too: longer than the slowest frame takes.
     pub hang_s: f64,
 }
 

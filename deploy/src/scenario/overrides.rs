@@ -1,4 +1,4 @@
-//! Settings of single vehicles over those of all.
+//! Settings of single vehicles that override those of all.
 
 use agent::config::AgentSettings;
 use localization::pose_source::PoseSourceConfig;
@@ -7,7 +7,7 @@ use serde::de::Error;
 use serde::{Deserialize, Deserializer, Serialize};
 use serde_json::{Map, Value};
 
-/// Fields of [`AgentSettings`] that one vehicle has of its own; each replaces that of all vehicles as a whole.
+/// Fields of [`AgentSettings`] that one vehicle overrides; each replaces that of all vehicles as a whole.
 #[derive(Debug, Clone, PartialEq, Default, Serialize)]
 #[serde(transparent)]
 pub struct AgentOverrides(Map<String, Value>);
@@ -29,7 +29,7 @@ impl JsonSchema for AgentOverrides {
         AgentSettings::schema_name()
     }
 
-    /// That of the settings: none of their fields is required.
+    /// Schema of the settings, with no field required.
     fn json_schema(generator: &mut SchemaGenerator) -> Schema {
         generator.subschema_for::<AgentSettings>()
     }
@@ -41,11 +41,11 @@ impl AgentOverrides {
     pub fn over(&self, settings: &AgentSettings) -> AgentSettings {
         let Ok(Value::Object(mut all)) = serde_json::to_value(settings) else { return settings.clone() };
         all.extend(self.0.clone());
-        // Both were settings before.
+        // Both were valid settings before.
         serde_json::from_value(Value::Object(all)).unwrap_or_else(|_| settings.clone())
     }
 
-    /// Changes the pose source, where the vehicle has one of its own.
+    /// Changes the pose source, if the vehicle overrides it.
     pub(super) fn map_pose(&mut self, change: impl FnOnce(PoseSourceConfig) -> PoseSourceConfig) {
         if !self.0.contains_key("pose") {
             return;

@@ -1,4 +1,4 @@
-//! One type, one meaning: files, command lines and schemas agree.
+//! Tests that files, command lines and schemas agree.
 
 use std::path::PathBuf;
 
@@ -83,7 +83,7 @@ fn agree<C: ProcessConfig + JsonSchema>() {
     for (path, described) in fields {
         let value = defaults.pointer(&format!("/{}", path.replace('.', "/")));
         let is_required = C::REQUIRED.contains(&path.as_str());
-        // What is not written where it is absent has no default.
+        // A field that is not written when absent has no default.
         if let Some(value) = value.filter(|_| !is_required) {
             assert_eq!(described.as_ref().unwrap_or(&Value::Null), value, "{path}: default in the schema");
         }
@@ -111,7 +111,7 @@ fn names(path: &str) -> Vec<String> {
     names
 }
 
-/// Fields of a schema that are no sections, with their defaults.
+/// Fields of a schema that are not sections, with their defaults.
 fn fields(root: &Value, schema: &Value) -> Vec<(String, Option<Value>)> {
     let mut all = Vec::new();
     for (name, property) in schema["properties"].as_object().unwrap() {

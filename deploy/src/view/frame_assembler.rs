@@ -1,4 +1,4 @@
-//! From messages, in whatever order they come, to moments.
+//! Assembles scene frames from messages in any order.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -9,66 +9,66 @@ use protocol::{
 
 use super::scene_frame::{Link, Messages, POINT_BYTES, Planar, Process, SceneFrame, ShownBox, Vehicle, decimate};
 
-/// Moments that may still be waiting for something.
+/// Largest number of incomplete scene frames.
 const MOST_OPEN: usize = 16;
-/// Processes whose books are kept: more than a run of 65 vehicles has.
-const MOST_BOOKS: usize = 1024;
-/// Vehicles that are shown: twice as many as an ego takes in. Those after them are not.
+/// Largest number of processes whose ledgers are kept: more than a run of 65 vehicles has.
+const MOST_LEDGERS: usize = 1024;
+/// Largest number of vehicles that are shown: twice as many as an ego accepts.
 const MOST_VEHICLES: usize = 128;
 
-/// A message that was seen somewhere.
+/// A captured message.
 #[derive(Debug, Clone, Copy)]
 pub struct Seen<'a> {
-    /// Where it was published.
+    /// Topic of its publication.
     pub topic: &'a Topic,
-    /// Its header.
+    /// Header of the message.
     pub header: &'a Header,
-    /// When it was seen, nanoseconds on the Unix clock.
+    /// Time of its capture, nanoseconds on the Unix clock.
     pub arrived_nanos: u64,
-    /// All of it, where its content is wanted.
+    /// Complete message, if its content is needed.
     pub payload: Option<&'a [u8]>,
 }
 
-/// What has come so far, by capture time.
+/// Messages so far, by capture time.
 #[derive(Default)]
 pub struct FrameAssembler {
-    open: BTreeMap<u64, Moment>,
+    open: BTreeMap<u64, OpenFrame>,
     shown_until: Option<u64>,
-    /// Which replay tells the truth.
+    /// Epoch of the replay that publishes the truth.
     replay_epoch: Option<u64>,
-    books: BTreeMap<String, (Ledger, Vec<StageSummary>)>,
-    /// Those of whom something came.
+    ledgers: BTreeMap<String, (Ledger, Vec<StageSummary>)>,
+    /// Vehicles with at least one message.
     vehicles: BTreeSet<CavId>,
 }
 
-/// What has come of one moment.
+/// Messages of one scene frame.
 #[derive(Default)]
-struct Moment {
+struct OpenFrame {
     truth: Option<(u64, Truth)>,
     result: Option<(u64, Detections)>,
-    /// And when they were published.
+    /// Each with its time of publication.
     poses: BTreeMap<CavId, (u64, PoseEstimate)>,
-    /// As they came: most moments of a busy run are never shown, and decoding is what costs.
+    /// Encoded: most scene frames of a busy run are never shown, and decoding is the largest cost.
     sweeps: BTreeMap<CavId, Vec<u8>>,
     own_boxes: BTreeMap<CavId, Boxes>,
-    /// Latest arrival from a vehicle: behind the link where there is one.
+    /// Latest arrival from a vehicle: after the link, if there is one.
     arrivals: BTreeMap<CavId, Arrival>,
 }
 
-/// How a message from a vehicle came.
+/// Arrival of a message from a vehicle.
 struct Arrival {
-    /// The larger, the more it says about the link: behind the air before ahead of it, data before poses.
+    /// Preference: after the link before ahead of it, data before poses.
     rank: u8,
     stream: Stream,
     latency_ms: f64,
 }
 
 impl FrameAssembler {
-    /// Takes a message in. A result completes its moment, which is returned; so does a moment of which no result has come
-    /// when too many wait. Unsound messages are left to those they are for.
+    /// Adds a message. A result completes its scene frame, which is returned; so is a scene frame without a result when
+    /// too many wait. Invalid messages are ignored here and counted by their receivers.
     pub fn add(&mut self, seen: &Seen<'_>) -> Option<SceneFrame> {
         if let Topic::Stats(_) = seen.topic {
-            self.keep_books(seen);
+            self.keep_ledger(seen);
             return None;
         }
         if let Topic::Stream { cav, .. } | Topic::Received { cav, .. } = seen.topic
@@ -98,28 +98,28 @@ impl FrameAssembler {
         is_known || (self.vehicles.len() < MOST_VEHICLES && self.vehicles.insert(cav.clone()))
     }
 
-    /// The moment at `capture_nanos` as far as it has come; older ones are given up.
+    /// The scene frame at `capture_nanos` with the messages so far; older ones are dropped.
     pub fn show(&mut self, capture_nanos: u64) -> Option<SceneFrame> {
-        let moment = self.open.remove(&capture_nanos)?;
+        let frame = self.open.remove(&capture_nanos)?;
         self.open.retain(|at, _| *at > capture_nanos);
         self.shown_until = Some(capture_nanos);
-        Some(moment.frame(capture_nanos, &self.books))
+        Some(frame.frame(capture_nanos, &self.ledgers))
     }
 
-    /// Forgets which moments were shown: a recording is looked at in any order.
+    /// Forgets which scene frames were shown: a recording is shown in any order.
     pub fn rewind(&mut self) {
         *self = Self::default();
     }
 
-    fn keep_books(&mut self, seen: &Seen<'_>) {
+    fn keep_ledger(&mut self, seen: &Seen<'_>) {
         let Some(Stats { process, ledger, stages }) = decode(seen) else { return };
         let process = process.to_string();
-        if self.books.len() < MOST_BOOKS || self.books.contains_key(&process) {
-            self.books.insert(process, (ledger, stages));
+        if self.ledgers.len() < MOST_LEDGERS || self.ledgers.contains_key(&process) {
+            self.ledgers.insert(process, (ledger, stages));
         }
     }
 
-    /// Another replay of the same run begins at its own first moment, which those shown do not hide.
+    /// Another replay of the same run begins at its own first tick, which the frames shown so far do not hide.
     fn begin_again_with(&mut self, epoch: u64) {
         if self.replay_epoch.replace(epoch).is_some_and(|known| known != epoch) {
             self.open.clear();
@@ -127,36 +127,36 @@ impl FrameAssembler {
         }
     }
 
-    /// Lays a message into its moment; tells whether that is complete now.
+    /// Adds a message to its scene frame; returns true if that is complete now.
     fn fill(&mut self, at: u64, seen: &Seen<'_>) -> bool {
         let published = seen.header.stamp.publish_nanos;
         match seen.topic {
             Topic::Truth => {
                 if let Some(truth) = decode(seen) {
-                    self.moment(at).truth = Some((published, truth));
+                    self.frame(at).truth = Some((published, truth));
                 }
             }
             Topic::Stream { stream: Stream::Detections, .. } => {
                 if let Some(result) = decode(seen) {
-                    self.moment(at).result = Some((published, result));
+                    self.frame(at).result = Some((published, result));
                     return true;
                 }
             }
             Topic::Stream { cav, stream: Stream::Lidar | Stream::Preview } => {
                 if let Some(payload) = seen.payload {
-                    self.moment(at).sweeps.insert(cav.clone(), payload.to_vec());
+                    self.frame(at).sweeps.insert(cav.clone(), payload.to_vec());
                 }
             }
             Topic::Stream { cav, stream } => {
                 match stream {
                     Stream::Pose => {
                         if let Some(estimate) = decode(seen) {
-                            self.moment(at).poses.insert(cav.clone(), (published, estimate));
+                            self.frame(at).poses.insert(cav.clone(), (published, estimate));
                         }
                     }
                     Stream::Boxes => {
                         if let Some(boxes) = decode(seen) {
-                            self.moment(at).own_boxes.insert(cav.clone(), boxes);
+                            self.frame(at).own_boxes.insert(cav.clone(), boxes);
                         }
                     }
                     _ => {}
@@ -176,13 +176,13 @@ impl FrameAssembler {
             _ => return,
         };
         let latency_ms = (seen.arrived_nanos as f64 - seen.header.stamp.publish_nanos as f64) / 1e6;
-        let arrivals = &mut self.moment(at).arrivals;
+        let arrivals = &mut self.frame(at).arrivals;
         if arrivals.get(cav).is_none_or(|known| known.rank <= rank) {
             arrivals.insert(cav.clone(), Arrival { rank, stream, latency_ms });
         }
     }
 
-    fn moment(&mut self, at: u64) -> &mut Moment {
+    fn frame(&mut self, at: u64) -> &mut OpenFrame {
         self.open.entry(at).or_default()
     }
 }
@@ -191,8 +191,8 @@ fn decode<M: Payload>(seen: &Seen<'_>) -> Option<M> {
     wire::decode([seen.payload?], &Limits::DEFAULT).map(|(_, message)| message).ok()
 }
 
-impl Moment {
-    fn frame(&self, capture_nanos: u64, books: &BTreeMap<String, (Ledger, Vec<StageSummary>)>) -> SceneFrame {
+impl OpenFrame {
+    fn frame(&self, capture_nanos: u64, ledgers: &BTreeMap<String, (Ledger, Vec<StageSummary>)>) -> SceneFrame {
         let result = self.result.as_ref().map(|(_, result)| result);
         let (vehicles, points) = self.vehicles();
         let began = self.truth.as_ref().map(|(began, _)| *began);
@@ -212,21 +212,21 @@ impl Moment {
             single: self.single(),
             links: self.links(),
             stages: result.map_or(Vec::new(), |result| result.stages.clone()),
-            processes: books
+            processes: ledgers
                 .iter()
                 .map(|(process, (_, stages))| Process { process: process.clone(), stages: stages.clone() })
                 .collect(),
-            messages: messages(books.values().map(|(ledger, _)| ledger)),
+            messages: messages(ledgers.values().map(|(ledger, _)| ledger)),
             points,
         }
     }
 
-    /// Everyone, the ego first, and their points.
+    /// Every vehicle, the ego first, and their points.
     fn vehicles(&self) -> (Vec<Vehicle>, Vec<u8>) {
         let ego = self.result.as_ref().map(|(_, result)| &result.ego);
-        let told = self.truth.iter().flat_map(|(_, truth)| truth.agents.iter().map(|agent| &agent.cav));
+        let in_truth = self.truth.iter().flat_map(|(_, truth)| truth.agents.iter().map(|agent| &agent.cav));
         let mut cavs: Vec<&CavId> = Vec::new();
-        for cav in ego.into_iter().chain(told).chain(self.poses.keys()).chain(self.sweeps.keys()) {
+        for cav in ego.into_iter().chain(in_truth).chain(self.poses.keys()).chain(self.sweeps.keys()) {
             if !cavs.contains(&cav) {
                 cavs.push(cav);
             }
@@ -291,19 +291,19 @@ impl Moment {
         objects.into_values().map(shown).collect()
     }
 
-    /// The ego's detections, where it believes to be.
+    /// The ego's detections, placed by its estimated pose.
     fn detections(&self) -> Vec<ShownBox> {
         let Some((_, result)) = &self.result else { return Vec::new() };
         self.placed(&result.ego, &result.pose, &result.detections, None)
     }
 
-    /// What vehicles sent as their own detections.
+    /// Detections that single vehicles sent.
     fn single(&self) -> Vec<ShownBox> {
         let each = |(cav, boxes): (&CavId, &Boxes)| self.placed(cav, &boxes.pose, &boxes.detections, Some(cav));
         self.own_boxes.iter().flat_map(each).collect()
     }
 
-    /// Detections in the frame of a vehicle, which are where it believes to be, or else where it is.
+    /// Detections in the frame of a vehicle, placed by its estimated pose, or else by its true one.
     fn placed(&self, cav: &CavId, pose: &PoseEstimate, found: &[Detection], source: Option<&CavId>) -> Vec<ShownBox> {
         let truth = self.truth.iter().flat_map(|(_, truth)| &truth.agents).find(|agent| agent.cav == *cav);
         let pose = pose.world_from_cav().or(truth.map(|agent| &agent.world_from_lidar));
@@ -352,7 +352,7 @@ impl Moment {
     }
 }
 
-/// Everyone's books added up.
+/// Sum of all ledgers.
 fn messages<'a>(ledgers: impl Iterator<Item = &'a Ledger>) -> Vec<Messages> {
     let mut sum = Ledger::default();
     ledgers.for_each(|ledger| sum.merge(ledger));

@@ -1,4 +1,4 @@
-//! A live run, as it goes.
+//! Live run: follows the newest scene frame.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -15,23 +15,23 @@ use tokio::time::{sleep, timeout};
 
 use super::frame_assembler::{FrameAssembler, Seen};
 
-/// Messages of one key that may wait to be looked at.
+/// Largest number of waiting messages of one key.
 const PLACES: usize = 4;
-/// The same of previews, which are taken only with the next other message.
+/// The same for previews, which are taken only with the next other message.
 const PREVIEW_PLACES: usize = 2;
-/// A page is given no more than this: ten moments a second.
+/// Shortest time between two scene frames of a page: ten a second.
 const SHORTEST_PERIOD: Duration = Duration::from_millis(95);
-/// How often a page is told that nothing has come, which also finds out that it is gone.
+/// Interval between empty messages to a page without a new frame, which also detect that it has closed.
 const HEARTBEAT: Duration = Duration::from_secs(1);
-/// What a page is told then.
+/// Empty message.
 const NOTHING_NEW: [u8; 4] = [0; 4];
-/// How often the thread looks whether somebody looks.
-const LOOK_ROUND: Duration = Duration::from_millis(100);
+/// Interval at which the thread checks for open pages.
+const CHECK_PERIOD: Duration = Duration::from_millis(100);
 
-/// The newest moment of a run, for any number of pages. The run is listened to only while somebody looks: nobody pays for a
-/// page that is not open. Points are those of previews, which are sent only while somebody listens to them.
+/// Newest scene frame of a run, for any number of pages. The run is subscribed to only while a page is open, so that a
+/// closed page costs nothing. Points are those of previews, which are sent only while they have a subscriber.
 pub struct LiveRun {
-    /// The newest moment behind its length; empty: none so far.
+    /// Newest scene frame after its length; empty: none so far.
     newest: Arc<watch::Sender<Bytes>>,
     run: RunId,
     ending: Arc<AtomicBool>,
@@ -39,7 +39,7 @@ pub struct LiveRun {
 }
 
 impl LiveRun {
-    /// Listens to the run of `bus`.
+    /// Starts the thread that follows the run of `bus`.
     ///
     /// # Errors
     /// [`BusError`] when the system gives no thread.
@@ -67,14 +67,14 @@ impl LiveRun {
         self.run.as_str()
     }
 
-    /// Pages that are open.
+    /// Number of open pages.
     #[must_use]
     pub fn watchers(&self) -> usize {
         self.newest.receiver_count()
     }
 
-    /// Moments for one page, each behind its length (32 bits, little-endian; 0: nothing new): the newest whenever the page
-    /// has taken the one before, until `limit` of them or the end of the run.
+    /// Scene frames for one page, each after its length (32 bits, little-endian; 0: nothing new): the newest whenever
+    /// the page has taken the previous one, until `limit` of them or the end of the run.
     pub fn moments(&self, limit: Option<u64>) -> impl Pieces<Item = Bytes> + Send + use<> {
         let newest = self.newest.subscribe();
         stream::unfold((newest, limit, Duration::ZERO), |(mut newest, left, pause)| async move {
@@ -105,7 +105,7 @@ impl Drop for LiveRun {
     }
 }
 
-/// The thread's side.
+/// State of the thread.
 struct Listener {
     bus: Bus,
     run: RunId,
@@ -114,13 +114,13 @@ struct Listener {
     assembly: FrameAssembler,
 }
 
-/// What is listened to while somebody looks.
-struct Ears {
+/// Subscriptions while a page is open.
+struct Subscriptions {
     previews: PassiveSubscriber,
     rest: PassiveSubscriber,
 }
 
-impl Ears {
+impl Subscriptions {
     fn open(bus: &Bus, run: &RunId) -> Result<Self, BusError> {
         let streams = [Stream::Pose, Stream::Boxes, Stream::Detections];
         let mut selectors: Vec<KeyExpr> = streams.map(|stream| KeyExpr::stream(run, stream)).into();
@@ -132,15 +132,15 @@ impl Ears {
 
 impl Listener {
     fn run(mut self) {
-        let mut ears: Option<Ears> = None;
+        let mut ears: Option<Subscriptions> = None;
         while !self.ending.load(Ordering::Relaxed) {
             if !self.is_watched() {
                 ears = None;
-                thread::sleep(LOOK_ROUND);
+                thread::sleep(CHECK_PERIOD);
                 continue;
             }
-            let Some(Ears { previews, rest }) = &ears else {
-                match Ears::open(&self.bus, &self.run) {
+            let Some(Subscriptions { previews, rest }) = &ears else {
+                match Subscriptions::open(&self.bus, &self.run) {
                     Ok(opened) => ears = Some(opened),
                     Err(error) => {
                         tracing::error!("nothing is shown: {error}");
@@ -149,12 +149,12 @@ impl Listener {
                 }
                 continue;
             };
-            // Previews first: a moment is shown when its result is taken, and its sweeps have come long before.
-            if let Pop::Item(_, overheard) = rest.take(Some(Instant::now() + LOOK_ROUND)) {
+            // Previews first: a scene frame is shown when its result is taken, and its sweeps have arrived long before.
+            if let Pop::Item(_, message) = rest.take(Some(Instant::now() + CHECK_PERIOD)) {
                 while let Pop::Item(_, preview) = previews.take(Some(Instant::now())) {
                     self.take(&preview);
                 }
-                self.take(&overheard);
+                self.take(&message);
             }
         }
         drop(ears);
@@ -167,14 +167,14 @@ impl Listener {
         self.newest.receiver_count() > 0
     }
 
-    fn take(&mut self, overheard: &RawMessage) {
-        let bytes = overheard.bytes();
+    fn take(&mut self, message: &RawMessage) {
+        let bytes = message.bytes();
         let Ok(header) = wire::decode_header([bytes.as_ref()]) else { return };
         if header.kind == Kind::Control {
             return;
         }
-        let topic = &overheard.key.topic;
-        let (arrived_nanos, payload) = (overheard.arrived_nanos, Some(bytes.as_ref()));
+        let topic = &message.key.topic;
+        let (arrived_nanos, payload) = (message.arrived_nanos, Some(bytes.as_ref()));
         let seen = Seen { topic, header: &header, arrived_nanos, payload };
         if let Some(frame) = self.assembly.add(&seen).filter(|_| self.is_watched()) {
             let frame = frame.to_bytes();

@@ -1,10 +1,9 @@
-//! A run to look at: a page with the scene from above, what crosses every link, and where the time goes.
+//! Page of a run: the scene from above, the traffic of every link, and the latency of each stage.
 //!
-//! The page is part of this program and loads nothing from anywhere else. What it shows comes from a live run
-//! ([`LiveRun`]), over a tap that nobody's books know of, or from a recorded one ([`RecordedRun`]); both put their messages
-//! through the same [`FrameAssembler`], and a [`SceneFrame`] is what comes out.
+//! The page is part of this program and loads nothing from anywhere else. Its data come from a live run ([`LiveRun`]),
+//! through a passive subscriber outside the message accounting, or from a recorded one ([`RecordedRun`]); both feed the
+//! same [`FrameAssembler`], which returns [`SceneFrame`]s.
 
-pub mod demo;
 mod frame_assembler;
 mod live;
 pub mod picture;

@@ -11,27 +11,27 @@ use plotters::prelude::BitMapBackend;
 use plotters::style::{Color, IntoFont, RGBColor, ShapeStyle, TextStyle};
 use protocol::{Box3d, Pose};
 
-/// Pixels a metre takes in the finished picture.
+/// Scale of the finished picture, pixels per metre.
 const PIXELS_PER_M: f64 = 12.0;
-/// Height of the strip below the map that holds legend and scale, pixels.
+/// Height of the strip below the plan view that holds legend and scale, pixels.
 const LEGEND_HEIGHT: u32 = 84;
 /// Narrowest picture, pixels: the legend needs as much.
 const MIN_WIDTH: u32 = 760;
-/// A picture is never larger than this, pixels a side: a scene's range comes from outside.
+/// Largest side of a picture, pixels: the range of a scene is external input.
 const MAX_SIDE: f64 = 8_192.0;
-/// A box is drawn when all its corners are at most this far from the map, metres.
+/// Largest distance of a drawn box's corners from the plan view, metres.
 const BOX_MARGIN_M: f64 = 50.0;
-/// Below this height in the LiDAR's frame is ground (about 1.9 m below the LiDAR), metres.
+/// Height in the LiDAR's frame below which points are ground (about 1.9 m below the LiDAR), metres.
 const GROUND_Z_M: f64 = -1.5;
 
 const BACKGROUND: RGBColor = RGBColor(14, 17, 22);
 const GRID: RGBColor = RGBColor(38, 44, 54);
 const INK: RGBColor = RGBColor(222, 226, 233);
 const FAINT: RGBColor = RGBColor(139, 148, 160);
-/// Truth is light and detections are red: told apart with any colour vision.
+/// Truth is light and detections are red: distinguishable with any colour vision.
 const TRUTH: RGBColor = RGBColor(240, 240, 240);
 const DETECTION: RGBColor = RGBColor(255, 94, 77);
-/// Colours of the CAVs, ego first; told apart from each other, and from truth and detections.
+/// Colours of the CAVs, ego first; distinct from each other, and from truth and detections.
 const CAV_COLOURS: [RGBColor; 6] = [
     RGBColor(120, 190, 255),
     RGBColor(255, 200, 87),
@@ -41,13 +41,13 @@ const CAV_COLOURS: [RGBColor; 6] = [
     RGBColor(160, 160, 160),
 ];
 
-/// The map: metres in the ego's LiDAR frame, x to the right and y up.
+/// The plan view: metres in the ego's LiDAR frame, x to the right and y up.
 type Plane<'a> = DrawingArea<BitMapBackend<'a>, Cartesian2d<RangedCoordf64, RangedCoordf64>>;
 
-/// What one CAV measured.
+/// Point cloud of one CAV.
 #[derive(Debug, Clone)]
 pub struct View<'a> {
-    /// Who.
+    /// Name of the CAV.
     pub name: String,
     /// Its LiDAR's pose in the ego's LiDAR frame.
     pub ego_from_cav: Pose,
@@ -60,19 +60,19 @@ pub struct View<'a> {
 pub struct Picture<'a> {
     /// Line on top of the legend.
     pub title: String,
-    /// Lower and upper x of the map, metres.
+    /// Lower and upper x of the plan view, metres.
     pub x_m: [f64; 2],
-    /// Lower and upper y of the map, metres.
+    /// Lower and upper y of the plan view, metres.
     pub y_m: [f64; 2],
-    /// Everyone's points; the ego first.
+    /// Point clouds of all CAVs; the ego first.
     pub views: Vec<View<'a>>,
-    /// What is there.
+    /// True boxes.
     pub truth: Vec<Box3d>,
-    /// What was found, with its score.
+    /// Detected boxes, with their scores, 0..1.
     pub detections: Vec<(Box3d, f32)>,
 }
 
-/// Why a picture could not be made.
+/// Reason why a picture could not be made.
 #[derive(Debug, thiserror::Error)]
 pub enum PictureError {
     /// The range is empty or far too large to draw.
@@ -98,7 +98,7 @@ impl Picture<'_> {
         Ok(figures::save_image(path, picture_size(map), |image| self.draw(map, image))?)
     }
 
-    /// Width and height of the map, pixels.
+    /// Width and height of the plan view, pixels.
     fn map_size(&self) -> Result<(u32, u32), PictureError> {
         let [width, height] = [self.x_m, self.y_m].map(|[low, high]| ((high - low) * PIXELS_PER_M).ceil());
         let can_be_drawn = |side: f64| (1.0..=MAX_SIDE).contains(&side);
@@ -115,7 +115,7 @@ impl Picture<'_> {
         let (x, y) = (self.x_m[0]..self.x_m[1], self.y_m[0]..self.y_m[1]);
         let plane = map.apply_coord_spec(Cartesian2d::new(x, y, (0..width as i32, height as i32..0)));
         self.draw_grid(&plane)?;
-        // The ego last, so that its points lie on top.
+        // The ego last, so that its points are on top.
         for (view, colour) in self.coloured_views().rev() {
             self.draw_points(view, colour, &plane)?;
         }
@@ -136,7 +136,7 @@ impl Picture<'_> {
         self.views.iter().enumerate().map(|(index, view)| (view, CAV_COLOURS[index % CAV_COLOURS.len()]))
     }
 
-    /// Whether a point lies on the map or at most `margin_m` beside it.
+    /// True if a point is on the plan view or at most `margin_m` outside it.
     fn is_near(&self, x: f64, y: f64, margin_m: f64) -> bool {
         let is_within = |[low, high]: [f64; 2], value| (low - margin_m..=high + margin_m).contains(&value);
         is_within(self.x_m, x) && is_within(self.y_m, y)
@@ -160,7 +160,7 @@ impl Picture<'_> {
         let ego_from_cav = view.ego_from_cav.isometry();
         for &[x, y, z, _] in view.xyzi {
             let point = ego_from_cav * nalgebra::Point3::new(f64::from(x), f64::from(y), f64::from(z));
-            // The ground only hints at the road; what stands on it is bright.
+            // The ground only indicates the road; objects on it are bright.
             let opacity = if point.z < GROUND_Z_M { 0.3 } else { 0.85 };
             if self.is_near(point.x, point.y, 0.0) {
                 plane.draw_pixel((point.x, point.y), &colour.mix(opacity))?;
@@ -231,8 +231,8 @@ fn draw_scale(area: &Image<'_>) -> Result<(), FigureError> {
     for line in [[(left, y), (right, y)], [(left, y - 4), (left, y + 4)], [(right, y - 4), (right, y + 4)]] {
         area.draw(&PathElement::new(line, stroke(FAINT)))?;
     }
-    let words = "10 m   x to the right, y up, ego LiDAR frame";
-    Ok(area.draw(&Text::new(words, (right + 10, y - 8), text(14, FAINT)))?)
+    let text_line = "10 m   x to the right, y up, ego LiDAR frame";
+    Ok(area.draw(&Text::new(text_line, (right + 10, y - 8), text(14, FAINT)))?)
 }
 
 fn picture_size((width, height): (u32, u32)) -> (u32, u32) {
@@ -273,7 +273,7 @@ mod tests {
         figures::render(picture_size(map), |image| picture.draw(map, image)).unwrap()
     }
 
-    /// Whether a pixel within one of the place has about this colour.
+    /// True if a pixel within one of the position has about this colour.
     fn shows(pixels: &[u8], [x, y]: [f64; 2], colour: RGBColor) -> bool {
         let (column, row) = ((PIXELS_PER_M * (x + 40.0)) as usize, (PIXELS_PER_M * (20.0 - y)) as usize);
         let wanted = [colour.0, colour.1, colour.2];

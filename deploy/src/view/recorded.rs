@@ -1,4 +1,4 @@
-//! A recorded run, moment by moment, in any order.
+//! Recorded run: random access to its scene frames.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -12,7 +12,7 @@ use super::frame_assembler::{FrameAssembler, Seen};
 use super::scene_frame::SceneFrame;
 use crate::operate::run_folder::{RECORDING, SWEEP_LOG};
 
-/// Why a run cannot be shown.
+/// Reason why a run cannot be shown.
 #[derive(Debug, thiserror::Error)]
 pub enum ViewError {
     /// The run was not recorded.
@@ -21,7 +21,7 @@ pub enum ViewError {
     /// The recording cannot be read.
     #[error(transparent)]
     Recording(#[from] RecordingError),
-    /// There is nothing to show.
+    /// Neither truth nor detections in the recording.
     #[error("{}: no truth and no detections in it", .0.display())]
     Empty(PathBuf),
 }
@@ -31,42 +31,42 @@ pub struct RecordedRun {
     recording: Recording,
     name: String,
     moments: Vec<Moment>,
-    /// When the sweep of each capture time reached the ego's agent, where the run noted that.
+    /// Arrival time of each sweep at the ego's agent, if the run recorded it.
     swept: BTreeMap<u64, u64>,
-    /// Where every process tells of its books.
+    /// Entries with the reports of all processes.
     stats: Vec<usize>,
     assembly: Mutex<FrameAssembler>,
 }
 
-/// One moment: its messages in the recording, and what the timeline shows of it.
+/// One scene frame: its messages in the recording, and its entry in the timeline.
 struct Moment {
     capture_nanos: u64,
-    /// When its truth was published.
+    /// Time of publication of its truth.
     began_nanos: Option<u64>,
     entries: Vec<usize>,
     summary: MomentSummary,
 }
 
-/// What the timeline shows of a moment.
+/// Entry of a scene frame in the timeline.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct MomentSummary {
     /// Capture time on the scene's clock, seconds.
     pub capture_s: f64,
-    /// From the publication of the tick to that of its detections, milliseconds; `None`: there are none.
+    /// From the publication of the tick to that of its detections, milliseconds; `None` without detections.
     pub latency_ms: Option<f64>,
-    /// Boxes detected.
+    /// Number of detected boxes.
     pub detected: usize,
-    /// Neighbours fused.
+    /// Number of fused neighbours.
     pub fused: usize,
     /// Distance of the ego's pose from the truth, metres.
     pub ego_error_m: Option<f64>,
 }
 
 impl RecordedRun {
-    /// Opens the recording at `path`, or that of the run folder `path`, and looks through it once.
+    /// Opens the recording at `path`, or that of the run folder `path`, and indexes it.
     ///
     /// # Errors
-    /// [`ViewError`] when there is none, or nothing to show in it.
+    /// [`ViewError`] when there is none, or it holds nothing to show.
     pub fn open(path: &Path) -> Result<Self, ViewError> {
         let file = if path.is_dir() { path.join(RECORDING) } else { path.to_path_buf() };
         if !file.is_file() {
@@ -108,24 +108,24 @@ impl RecordedRun {
         &self.name
     }
 
-    /// How many moments there are.
+    /// Number of scene frames.
     #[must_use]
     pub fn len(&self) -> usize {
         self.moments.len()
     }
 
-    /// Never: there is something to show.
+    /// Always false: an empty recording cannot be opened.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.moments.is_empty()
     }
 
-    /// What the timeline shows.
+    /// Entries of the timeline.
     pub fn timeline(&self) -> impl Iterator<Item = &MomentSummary> {
         self.moments.iter().map(|moment| &moment.summary)
     }
 
-    /// A moment, counted from 0; `None` behind the last.
+    /// A scene frame, counted from 0; `None` after the last.
     ///
     /// # Errors
     /// [`RecordingError`] when the file has changed.
@@ -134,10 +134,10 @@ impl RecordedRun {
         let mut assembly = self.assembly.lock().unwrap_or_else(PoisonError::into_inner);
         assembly.rewind();
         let until = moment.entries.iter().map(|entry| self.entry(*entry).arrived_nanos).max().unwrap_or(0);
-        // Results come last, and show the moment.
+        // Results come last, and complete the scene frame.
         let (results, others): (Vec<usize>, Vec<usize>) =
             moment.entries.iter().partition(|entry| is_result(&self.entry(**entry).key.topic));
-        for index in self.books_until(until).into_iter().chain(others).chain(results) {
+        for index in self.reports_until(until).into_iter().chain(others).chain(results) {
             let entry = self.entry(index);
             let payload = if is_wanted(&entry.key.topic) { Some(self.recording.read(entry)?) } else { None };
             let Entry { key, header, arrived_nanos, .. } = entry;
@@ -159,8 +159,8 @@ impl RecordedRun {
         &self.recording.entries()[index]
     }
 
-    /// The last word of every process until `nanos`.
-    fn books_until(&self, nanos: u64) -> Vec<usize> {
+    /// Last report of every process until `nanos`.
+    fn reports_until(&self, nanos: u64) -> Vec<usize> {
         let mut last = BTreeMap::new();
         for index in self.stats.iter().copied().filter(|index| self.entry(*index).arrived_nanos <= nanos) {
             last.insert(&self.entry(index).key.topic, index);
@@ -168,7 +168,7 @@ impl RecordedRun {
         last.into_values().collect()
     }
 
-    /// `None` where there is neither truth nor result: nothing happened then.
+    /// `None` if there is neither truth nor result.
     fn summary(&self, capture_nanos: u64, entries: &[usize]) -> Result<Option<MomentSummary>, RecordingError> {
         let mut summary = MomentSummary { capture_s: capture_nanos as f64 / 1e9, ..MomentSummary::default() };
         let (mut truth, mut result) = (None, None);
@@ -208,7 +208,7 @@ fn is_result(topic: &Topic) -> bool {
     matches!(topic, Topic::Stream { stream: Stream::Detections, .. })
 }
 
-/// Whether a message's content is shown, and not only how it came.
+/// True if a message's content is shown, and not only its arrival.
 fn is_wanted(topic: &Topic) -> bool {
     const SHOWN: [Stream; 4] = [Stream::Lidar, Stream::Pose, Stream::Boxes, Stream::Detections];
     matches!(topic, Topic::Truth | Topic::Stats(_))

@@ -1,4 +1,4 @@
-//! One moment of a run as the page gets it.
+//! Scene frame: the state of a run at one capture time, as sent to the page.
 
 use std::collections::BTreeMap;
 
@@ -7,19 +7,19 @@ use protocol::{
 };
 use serde::{Serialize, Serializer};
 
-/// Points of one sweep that the page is given at most: more than a screen has pixels for them.
+/// Largest number of points of one sweep on the page: more than a screen has pixels for them.
 const MAX_POINTS: usize = 12_000;
-/// Bytes of a point on its way to the page.
+/// Bytes of a point as sent to the page.
 pub(super) const POINT_BYTES: usize = 6;
 
-/// One moment: numbers for the panels, boxes and poses in the world's frame, and everyone's points.
+/// Scene frame: values for the panels, boxes and poses in the world frame, and the points of all vehicles.
 ///
-/// On its way it is a JSON document behind its length (32 bits, little-endian), then the points.
+/// Sent as a JSON document after its length (32 bits, little-endian), then the points.
 #[derive(Debug, Clone, Default, Serialize)]
 pub struct SceneFrame {
     /// Capture time on the scene's clock, seconds.
     pub capture_s: f64,
-    /// Tick of the scene, where the truth says so.
+    /// Tick of the scene, from the truth.
     pub tick: Option<u64>,
     /// The fusing vehicle.
     pub ego: Option<CavId>,
@@ -27,115 +27,116 @@ pub struct SceneFrame {
     pub method: Option<String>,
     /// From the publication of the tick to that of its detections, milliseconds.
     pub latency_ms: Option<f64>,
-    /// From the publication of the tick until its sweep had reached the ego's agent, milliseconds; known only afterwards.
+    /// From the publication of the tick to the arrival of its sweep at the ego's agent, milliseconds; known only in
+    /// recorded runs.
     pub swept_ms: Option<f64>,
-    /// From the publication of the tick until the ego's agent said where it is, milliseconds.
+    /// From the publication of the tick to that of the ego's pose, milliseconds.
     pub posed_ms: Option<f64>,
-    /// Every vehicle that was heard of.
+    /// Every vehicle from which a message was captured.
     pub vehicles: Vec<Vehicle>,
-    /// What is there, every object once.
+    /// True objects, each once.
     pub truth: Vec<ShownBox>,
-    /// What the ego detects, where it believes to be.
+    /// Detections of the ego, placed by its estimated pose.
     pub detections: Vec<ShownBox>,
-    /// What single vehicles detect and send, where they do (late fusion).
+    /// Detections that single vehicles send (late fusion).
     pub single: Vec<ShownBox>,
-    /// What crosses the air.
+    /// Traffic of each link.
     pub links: Vec<Link>,
-    /// What the ego spent its time with.
+    /// Durations of the ego's stages.
     pub stages: Vec<StageTiming>,
-    /// How long the stages of each process take.
+    /// Durations of the stages of each process.
     pub processes: Vec<Process>,
     /// Messages of all processes so far, by topic and receiver.
     pub messages: Vec<Messages>,
-    /// Bytes of points behind the JSON document, in order of `vehicles`; three 16-bit numbers each, centimetres.
+    /// Points after the JSON document, in order of `vehicles`; three 16-bit numbers each, centimetres.
     #[serde(skip)]
     pub points: Vec<u8>,
 }
 
-/// A vehicle at this moment.
+/// A vehicle in a scene frame.
 #[derive(Debug, Clone, Serialize)]
 pub struct Vehicle {
-    /// Who.
+    /// Id of the vehicle.
     pub cav: CavId,
-    /// Where it believes to be.
+    /// Estimated pose.
     pub pose: Option<Planar>,
-    /// How sure it is of that, 0..=1.
+    /// Confidence of that pose, 0..=1.
     pub confidence: Option<f32>,
-    /// Why it has no pose.
+    /// Reason for a missing pose.
     pub no_pose: Option<NoPoseReason>,
-    /// Where it is.
+    /// True pose.
     pub truth: Option<Planar>,
     /// Distance between the two, metres.
     pub error_m: Option<f64>,
-    /// By which its points are shown; the page gets the first two rows of it.
+    /// Transform of its points; the page gets the first two rows of it.
     #[serde(serialize_with = "first_two_rows")]
     pub world_from_lidar: Option<Pose>,
-    /// How many points of it follow.
+    /// Number of its points that follow.
     pub points: usize,
 }
 
 /// A pose seen from above.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Planar {
-    /// Metres.
+    /// x in the world frame, metres.
     pub x_m: f64,
-    /// Metres.
+    /// y in the world frame, metres.
     pub y_m: f64,
-    /// Radians.
+    /// Heading, radians.
     pub yaw_rad: f64,
 }
 
-/// A box in the world's frame.
+/// A box in the world frame.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct ShownBox {
-    /// Where.
+    /// Its rectangle.
     #[serde(flatten)]
     pub box3d: Box3d,
     /// Confidence of a detection, 0..1.
     pub score: Option<f32>,
-    /// Whose detection it is, where one vehicle alone saw it.
+    /// Vehicle that sent the detection, for those of single vehicles.
     pub source: Option<CavId>,
     /// Class of a true object.
     pub class: Option<String>,
 }
 
-/// What came from one vehicle to an ego for this moment.
+/// Traffic from one vehicle to an ego for one frame.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct Link {
-    /// Who sent.
+    /// Id of the sender.
     pub from: String,
-    /// Who received.
+    /// Id of the receiver.
     pub to: String,
-    /// From publication to arrival, milliseconds, of what was seen here.
+    /// From publication to arrival, milliseconds, of the captured message.
     pub latency_ms: Option<f64>,
-    /// Of which stream that is.
+    /// Stream of that message.
     pub stream: Option<String>,
-    /// Bytes on the wire that were fused.
+    /// Wire bytes of the fused messages.
     pub wire_bytes: Option<u64>,
-    /// How much older than the ego's sweep it was, milliseconds.
+    /// Age relative to the ego's sweep, milliseconds.
     pub age_ms: Option<f64>,
-    /// Whether it was fused.
+    /// True if it was fused.
     pub is_fused: bool,
-    /// Why it was not.
+    /// Reason for which it was not.
     pub skipped: Option<DropReason>,
-    /// How likely the receiver thinks the sender honest, 0..=1, where it asks.
+    /// Trust score of the sender, 0..=1, if the receiver uses misbehaviour detection.
     pub trust: Option<f64>,
-    /// Why it does not believe it.
+    /// Misbehaviour reason, if the sender was excluded.
     pub doubt: Option<MisbehaviourReason>,
-    /// The sender's clock less the receiver's, less the shortest time a message was under way, milliseconds.
+    /// Offset of the sender's clock from the receiver's, less the shortest transmission time, milliseconds.
     pub clock_ms: Option<f64>,
 }
 
 /// The stages of a process.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Process {
-    /// Its name.
+    /// Name of the process.
     pub process: String,
     /// Its stages.
     pub stages: Vec<StageSummary>,
 }
 
-/// What was counted on one topic towards one receiver, or by its sender.
+/// Counters of one topic towards one receiver, or at its sender.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Messages {
     /// The topic.
@@ -163,7 +164,7 @@ impl SceneFrame {
         })
     }
 
-    /// The frame as the page gets it.
+    /// The frame as sent to the page.
     ///
     /// # Panics
     /// Never: every field has a spelling in JSON.
@@ -195,7 +196,7 @@ fn first_two_rows<S: Serializer>(pose: &Option<Pose>, serializer: S) -> Result<S
     pose.as_ref().map(rows).serialize(serializer)
 }
 
-/// The points of a sweep as the page gets them, evenly decimate out where there are many.
+/// The points of a sweep as sent to the page, evenly decimated if there are many.
 pub(super) fn decimate(points: &PointCloud) -> Vec<u8> {
     let centimetres = |metres: f32| ((metres * 100.0).round() as i16).to_le_bytes();
     let decimate = points.decimate(MAX_POINTS);

@@ -1,4 +1,4 @@
-//! The page and what it asks for.
+//! Web server of the page and of its data.
 
 use std::io;
 use std::net::SocketAddr;
@@ -14,23 +14,23 @@ use super::{LiveRun, RecordedRun};
 
 const HTML: &str = include_str!("page/index.html");
 const STYLE: &str = include_str!("page/style.css");
-/// In the order in which the page loads them.
+/// Scripts, in the order in which the page loads them.
 const SCRIPTS: [(&str, &str); 3] = [
     ("/view.js", include_str!("page/view.js")),
     ("/scene.js", include_str!("page/scene.js")),
     ("/moments.js", include_str!("page/moments.js")),
 ];
 
-/// A moment, or a stream of them.
+/// Content type of scene frames.
 const BINARY: &str = "application/octet-stream";
 
-/// A page is not put off for longer than this.
+/// Longest delay of a page's load.
 const LONGEST_HOLD: Duration = Duration::from_secs(10);
 
 /// Serves the page of a live run until dropped.
 ///
 /// # Errors
-/// When the address cannot be listened at.
+/// [`io::Error`] when the address cannot be listened at.
 pub fn serve_live(address: SocketAddr, run: Arc<LiveRun>) -> io::Result<WebServer> {
     WebServer::start(address, move |request| match request.path.as_str() {
         "/run" => document(&json!({"mode": "live", "run": run.name()})),
@@ -42,7 +42,7 @@ pub fn serve_live(address: SocketAddr, run: Arc<LiveRun>) -> io::Result<WebServe
     })
 }
 
-/// An empty script that takes its time, by which a page puts off being loaded.
+/// An empty script with a delay, by which a page defers its load event.
 fn hold(query: &str) -> Answer {
     let time = Duration::from_millis(number("ms", query).unwrap_or(0)).min(LONGEST_HOLD);
     let wait = async move {
@@ -55,7 +55,7 @@ fn hold(query: &str) -> Answer {
 /// Serves the page of a recorded run until dropped.
 ///
 /// # Errors
-/// When the address cannot be listened at.
+/// [`io::Error`] when the address cannot be listened at.
 pub fn serve_recorded(address: SocketAddr, run: Arc<RecordedRun>) -> io::Result<WebServer> {
     WebServer::start(address, move |request| {
         if request.path == "/run" {
@@ -87,7 +87,7 @@ fn document(value: &serde_json::Value) -> Answer {
     Answer::Page { content_type: "application/json", body: value.to_string().into() }
 }
 
-/// The number that a query gives for `name`.
+/// Number that a query has for `name`.
 fn number(name: &str, query: &str) -> Option<u64> {
     query.split('&').find_map(|pair| pair.strip_prefix(name)?.strip_prefix('='))?.parse().ok()
 }

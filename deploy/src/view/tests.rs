@@ -1,4 +1,4 @@
-//! The page over a recorded and a live run that a test makes up.
+//! Tests of the page on a synthetic recorded and a synthetic live run.
 
 use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream};
@@ -119,7 +119,7 @@ fn record(folder: &Path) -> RecordedRun {
     RecordedRun::open(folder).unwrap()
 }
 
-/// The JSON document of a moment, and how many points follow.
+/// The JSON document of a scene frame, and the number of points that follow.
 fn parsed(bytes: &[u8]) -> (Value, usize) {
     let (len, rest) = bytes.split_at(4);
     let (json, points) = rest.split_at(u32::from_le_bytes(len.try_into().unwrap()) as usize);
@@ -128,8 +128,8 @@ fn parsed(bytes: &[u8]) -> (Value, usize) {
 
 fn check(frame: &Value, points: usize) {
     assert_eq!((&frame["ego"], &frame["method"]), (&EGO.into(), &"max".into()));
-    assert_eq!(frame["truth"].as_array().unwrap().len(), 1, "everyone lists it, and it is shown once");
-    // 10 m ahead of an ego at (tick, 0) that looks 0.2 rad to the left.
+    assert_eq!(frame["truth"].as_array().unwrap().len(), 1, "all vehicles annotate it, and it is shown once");
+    // 10 m ahead of an ego at (tick, 0) with a heading of 0.2 rad to the left.
     let tick = frame["tick"].as_u64().unwrap() as f64;
     let x = frame["detections"][0]["center_m"][0].as_f64().unwrap();
     assert!((x - (tick + 10.0 * 0.2_f64.cos())).abs() < 1e-9, "{x}");
@@ -227,13 +227,13 @@ fn publish(bus: Bus, ending: &AtomicBool) {
     for tick in 0.. {
         for (topic, payload) in messages(tick, bus::unix_nanos(), Stream::Preview) {
             if matches!(topic, Topic::Stream { stream: Stream::Detections, .. }) {
-                // As long as perception takes: sweeps are far ahead of what comes of them.
+                // As long as perception takes: sweeps are far ahead of their results.
                 std::thread::sleep(Duration::from_millis(50));
             }
             let is_preview = matches!(topic, Topic::Stream { stream: Stream::Preview, .. });
             let options = if is_preview { PublisherOptions::PREVIEW } else { PublisherOptions::SENSOR };
             let publisher = publishers.entry(topic.clone()).or_insert_with(|| bus.publisher(topic, options).unwrap());
-            // As it is: stamp and all.
+            // Unchanged: stamp and all.
             publisher.offer_encoded(0, move |_| Ok(protocol::Encoded { head: payload, body: protocol::Body::Empty }));
         }
         std::thread::sleep(Duration::from_millis(50));
@@ -244,27 +244,27 @@ fn publish(bus: Bus, ending: &AtomicBool) {
 }
 
 #[test]
-fn a_live_run_is_shown_as_it_goes_and_nobody_waits_for_a_page() {
+fn a_live_run_is_shown_and_a_slow_page_delays_no_other() {
     let traffic = Traffic::start();
     let run = Arc::new(LiveRun::start(join(&BusOptions::client(traffic.endpoint.clone()), "viewer")).unwrap());
     let server = serve_live("127.0.0.1:0".parse().unwrap(), Arc::clone(&run)).unwrap();
 
-    // Anything is listened to only once somebody looks.
+    // The run is subscribed to only once a page is open.
     let moments: Vec<_> = moments_of(server.address(), 20).iter().map(|bytes| parsed(bytes)).collect();
     let captures: Vec<f64> = moments.iter().map(|(frame, _)| frame["capture_s"].as_f64().unwrap()).collect();
     assert!(captures.windows(2).all(|pair| pair[0] < pair[1]), "always a newer one: {captures:?}");
-    // On a busy machine the tap drops parts of some moments, but hardly ever of all.
+    // On a busy machine the passive subscriber drops parts of some frames, but hardly ever of all.
     let whole =
         |frame: &Value, points: usize| !frame["ego"].is_null() && !frame["truth"][0].is_null() && points == 8_000;
     let (frame, points) = moments.iter().find(|(frame, points)| whole(frame, *points)).expect("a whole moment");
     check(frame, *points);
-    wait_for("nobody looks any more", || run.watchers() == 0);
+    wait_for("no page is open", || run.watchers() == 0);
 
     // A browser that never reads.
     let mut asleep = TcpStream::connect(server.address()).unwrap();
     asleep.write_all(b"GET /live HTTP/1.1\r\n\r\n").unwrap();
     wait_for("it is counted as a watcher", || run.watchers() == 1);
-    // Others are served all the while.
+    // Others are served meanwhile.
     assert_eq!(moments_of(server.address(), 3).len(), 3);
     wait_for("it is dropped", || server.readers().dropped() == 1);
     wait_for("and no watcher any more", || run.watchers() == 0);
@@ -311,18 +311,19 @@ fn shows_without_an_error(address: SocketAddr, query: &str, mode: &str) {
             .args(["--disable-background-networking", "--disable-component-update", "--disable-sync"])
             .arg(format!("--user-data-dir={}", profile.path().display()))
             .arg(format!("--window-size={width},{height}"))
-            // A live page holds itself back until moments have come; time that is made up would not wait for them.
+            // A live page defers its load event until frames have arrived; a virtual time budget would not wait for
+            // them.
             .args((mode == "recorded").then_some("--virtual-time-budget=20000"))
             .args(["--enable-logging=stderr", "--dump-dom"])
             .arg(format!("http://{address}/{query}"))
             .output()
             .unwrap();
         let page = String::from_utf8_lossy(&output.stdout);
-        let said = String::from_utf8_lossy(&output.stderr);
-        assert!(page.contains("data-errors=\"0\""), "{page}\n{said}");
-        assert!(!page.contains("data-frames=\"0\""), "{page}\n{said}");
+        let stderr = String::from_utf8_lossy(&output.stderr);
+        assert!(page.contains("data-errors=\"0\""), "{page}\n{stderr}");
+        assert!(!page.contains("data-frames=\"0\""), "{page}\n{stderr}");
         assert!(page.contains(&format!("data-mode=\"{mode}\"")) || page.contains("live, stopped"), "{page}");
-        assert!(!said.contains("Uncaught"), "{said}");
+        assert!(!stderr.contains("Uncaught"), "{stderr}");
     }
 }
 

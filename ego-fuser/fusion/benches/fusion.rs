@@ -1,4 +1,4 @@
-//! Warping and fusing maps of `lean`, per method and number of vehicles.
+//! Warping and fusing BEV feature maps of `lean`, per method and number of vehicles.
 //!
 //! `cargo bench -p ego-fuser --bench fusion -- fuse/pastat/4`: three neighbours and the ego, three time steps.
 
@@ -16,7 +16,7 @@ use protocol::{BevGrid, Pose};
 use tch::nn::VarStore;
 use tch::{Device, Kind, Tensor, no_grad};
 
-/// Edge of what a vehicle covers of a map together with what lies close to it, cells of 0.8 m.
+/// Edge of the area of a feature map that a vehicle and its close surroundings cover, cells of 0.8 m.
 const VEHICLE_CELLS: i64 = 8;
 
 fn fuse(criterion: &mut Criterion) {
@@ -30,7 +30,7 @@ fn fuse(criterion: &mut Criterion) {
     let mut group = criterion.benchmark_group("lean");
     for agents in [1usize, 2, 4] {
         for Case { name, stage, is_lost } in cases(&config) {
-            // The newest of all first, as the ego gives them.
+            // The newest of all first, in the order that the ego uses.
             let entries =
                 (0..stage.requirements().history.frames).flat_map(|step| (0..agents).map(move |agent| (step, agent)));
             let facts: Vec<_> = entries.map(|(step, agent)| entry(step, agent)).collect();
@@ -41,7 +41,7 @@ fn fuse(criterion: &mut Criterion) {
             });
             let seen: Vec<Tensor> = seen.collect();
             let features = Tensor::cat(&seen, 0);
-            // As the ego keeps them.
+            // In the form in which the ego keeps them.
             let of = |first: i64, count: i64| ReceivedMaps::new(features.narrow(0, first, count), None);
             let newest = of(0, agents as i64);
             let kept: Vec<ReceivedMaps> = no_grad(|| {
@@ -51,12 +51,12 @@ fn fuse(criterion: &mut Criterion) {
             let align = || {
                 let kept: Vec<&ReceivedMaps> = kept.iter().collect();
                 let earlier = (!kept.is_empty()).then(|| ReceivedMaps::together(&kept).expect("maps of one size"));
-                stage.align_with(&newest, earlier, &facts).expect("maps lie on the lattice")
+                stage.align_with(&newest, earlier, &facts).expect("maps are on the grid")
             };
             group.bench_function(BenchmarkId::new(format!("warp/{name}"), agents), |bencher| {
                 bencher.iter(|| black_box(no_grad(align)));
             });
-            // No gradient, as in the ego: what has one lies elsewhere in memory, and takes longer.
+            // No gradient, as in the ego: tensors with a gradient have another memory layout and take longer.
             let maps = no_grad(align);
             group.bench_function(BenchmarkId::new(format!("fuse/{name}"), agents), |bencher| {
                 bencher.iter(|| {
@@ -70,18 +70,19 @@ fn fuse(criterion: &mut Criterion) {
     group.finish();
 }
 
-/// What is around the ego. Vehicles' maps show the same world, so that they fit where poses put them.
+/// Surroundings of the ego. Vehicles' feature maps show the same world, so that they match at their poses.
 struct World {
-    /// `[1, C, H, W]`, on the ego's lattice.
+    /// `[1, C, H, W]`, on the ego's BEV grid.
     map: Tensor,
-    /// Half the lattice, metres along x and y; its middle is the ego.
+    /// Half the extent of the grid, metres along x and y; the ego is at its centre.
     half_m: [f64; 2],
 }
 
 impl World {
     fn random(shape: [i64; 3], grid: &BevGrid) -> Self {
         let [channels, height, width] = shape;
-        // Alike over about a vehicle's length and width, so that what is worth a recall lies together as around vehicles.
+        // Similar over about a vehicle's length and width, so that cells worth blending are adjacent, as around
+        // vehicles.
         let places = [1, channels, height / VEHICLE_CELLS, width / VEHICLE_CELLS];
         let map = Tensor::rand(places, (Kind::Float, Device::Cpu)).upsample_nearest2d([height, width], None, None);
         Self { map, half_m: [width, height].map(|cells| cells as f64 * grid.cell_m / 2.0) }
@@ -101,11 +102,11 @@ impl World {
 struct Case {
     name: String,
     stage: FusionStage,
-    /// Every map but the ego's newest shows a world of its own: the most that FSA may have to do.
+    /// Every feature map but the ego's newest shows a different world: the worst case for FSA.
     is_lost: bool,
 }
 
-/// All that fuse maps, and the turning of channels that comes with each.
+/// All methods that fuse feature maps, and their orientation-conditioned channel mixing.
 fn cases(config: &DetectorConfig) -> Vec<Case> {
     let case = |name: &str, method: Method, fusion: &FusionConfig, is_lost: bool| {
         let variables = VarStore::new(Device::Cpu);
@@ -122,7 +123,7 @@ fn cases(config: &DetectorConfig) -> Vec<Case> {
     cases
 }
 
-/// What is known of a vehicle's map from some time steps ago.
+/// Metadata of a vehicle's feature map from some time steps ago.
 fn entry(step: usize, agent: usize) -> MapMetadata {
     let [step_m, agent_m] = [step, agent].map(|count| 7.0 * count as f64);
     let pose = Pose::from_xyz_yaw([agent_m - 0.1 * step_m, 2.0 * agent as f64, 0.0], 0.2 * agent as f64);

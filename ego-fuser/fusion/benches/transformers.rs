@@ -1,10 +1,10 @@
-//! V2X-ViT and CoBEVT at their published sizes on two threads, and lean on one: time, and how much of the machine they use.
+//! V2X-ViT and CoBEVT at their published sizes on two threads, and lean on one: time and share of the machine's peak.
 //!
 //! `cargo bench -p ego-fuser --bench transformers -- v2xvit/5`
 //!
-//! Beside each time stands what it is made of: floating-point operations of the products of matrices (a multiplication
-//! and an addition count as two; sums, norms and exponentials as none), how many of them a second, and how much that is of
-//! what the machine reaches in the 3x3 convolutions of the encoder.
+//! Each time is printed with its floating-point operations: those of matrix products (a multiplication and an addition
+//! count as two; sums, norms and exponentials as none), the rate per second, and its share of the rate that the machine
+//! reaches in the 3x3 convolutions of the encoder.
 
 use std::hint::black_box;
 use std::time::Instant;
@@ -20,14 +20,14 @@ use protocol::{BevGrid, Pose};
 use tch::nn::VarStore;
 use tch::{Device, Kind, Tensor, no_grad};
 
-/// Channels, rows and columns of a full-size map.
+/// Channels, rows and columns of a full-size feature map.
 const FULL: [i64; 3] = [256, 48, 176];
-/// The same of a lean map.
+/// The same of a lean feature map.
 const LEAN: [i64; 3] = [64, 96, 128];
 /// GFLOP/s that two threads reach in 3x3 convolutions.
 const MACHINE: f64 = 115.0;
 
-/// Operations of V2X-ViT for `agents` agents, of which only the ego's result is wanted, in GFLOP.
+/// Operations of V2X-ViT for `agents` agents when only the ego's result is needed, in GFLOP.
 fn v2xvit_gflop(config: &V2xVitConfig, agents: i64, cells: i64) -> f64 {
     let (channels, inner) = (config.channels, config.agent_heads * config.agent_head_channels);
     let key_value = 2 * channels * inner;
@@ -41,7 +41,7 @@ fn v2xvit_gflop(config: &V2xVitConfig, agents: i64, cells: i64) -> f64 {
     2e-9 * (cells * (blocks + feeds)) as f64
 }
 
-/// The same for CoBEVT, where all agents are wanted to the end.
+/// The same for CoBEVT, where all agents are computed to the end.
 fn cobevt_gflop(config: &SwapFusionConfig, agents: i64, cells: i64) -> f64 {
     let attention =
         4 * config.channels * config.channels + 2 * agents * config.window * config.window * config.channels;
@@ -85,7 +85,7 @@ fn fuse(criterion: &mut Criterion) {
     measure(criterion, "lean-ermvp", &ermvp_fusion, 4, LEAN, ermvp_gflop(&ermvp, 4, height * width));
 }
 
-/// The queries of ERMVP come from a map of a sixteenth of the cells: what they cost is left out.
+/// The queries of ERMVP come from a feature map of a sixteenth of the cells: their cost is left out.
 fn ermvp_gflop(config: &ErmvpConfig, agents: i64, cells: i64) -> f64 {
     let channels = config.layers.channels;
     let query = config.layers.depth as i64 * agents * channels * channels;

@@ -38,9 +38,9 @@ impl FusionSettings for AttentionConfig {
     }
 }
 
-/// Per-cell attention of the ego over all agents.
+/// Per-cell attention of the ego to all agents.
 ///
-/// Of the attention matrix only the ego's row is kept in the end, so only that row is computed.
+/// Only the ego's row of the attention matrix is used, so only that row is computed.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct AttentionFusion;
 
@@ -50,7 +50,7 @@ impl Fusion for AttentionFusion {
     }
 }
 
-/// `[C, H, W]` that the ego attends to at every cell.
+/// `[C, H, W]`: attention output of the ego at every cell.
 pub(super) fn attended(WarpedMaps { features, mask }: &WarpedMaps) -> Result<Tensor, TchError> {
     if features.size4()?.0 == 1 {
         return features.f_get(0);

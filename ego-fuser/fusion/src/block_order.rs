@@ -1,12 +1,13 @@
-//! Cells of a map as tokens, ordered so that every window is one run of them.
+//! Token order: the cells of a feature map, ordered so that every window is one contiguous run.
 //!
-//! Square windows of edges that divide one another nest: a window of 16 cells holds four of 8, each of those four of 4.
-//! With the tokens of each window behind one another at every level, cutting a map into windows of any of the edges is
-//! a view; attention over windows of several sizes then moves the map twice in all, on the way in and on the way out.
+//! Square windows whose edges divide one another nest: a window of 16 cells holds four of 8, each of those four of 4.
+//! When the tokens of each window are contiguous at every level, partitioning a feature map into windows of any of the
+//! edges is a view; attention over windows of several sizes then copies the feature map twice in all, on the way in and
+//! on the way out.
 
 use tch::{TchError, Tensor};
 
-/// An order of the cells of maps.
+/// An order of the cells of a feature map.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct BlockOrder {
     /// Edges of the windows in cells, each dividing the next.
@@ -14,7 +15,7 @@ pub struct BlockOrder {
 }
 
 impl BlockOrder {
-    /// The order for windows of these edges; nothing when some edge does not divide the next larger one.
+    /// The order for windows of these edges; `None` when some edge does not divide the next larger one.
     #[must_use]
     pub fn new(edges: &[i64]) -> Option<Self> {
         let mut edges = edges.to_vec();

@@ -1,21 +1,22 @@
-//! What a neighbour's features mean in the ego's frame.
+//! Orientation-conditioned channel mixing: converts a neighbour's features to the axes of the ego.
 //!
-//! An encoder writes headings and offsets into its channels relative to its own axes. The reference codes train and test
-//! with clouds that were projected to the ego's frame before encoding, so that all maps share its axes; a vehicle that
-//! broadcasts one map to everyone cannot do that. Resampling moves cells and leaves what stands in them unturned, so the
-//! channels are turned here: by a learnt matrix that depends on the relative heading.
+//! An encoder writes headings and offsets into its channels relative to its own axes. The reference codes train and
+//! test with clouds that were projected to the ego's frame before encoding, so that all feature maps share its axes; a
+//! vehicle that broadcasts one feature map to all receivers cannot do that. Resampling moves cells and leaves the
+//! directions in their channels unrotated. The channels are therefore mixed here by a learnt matrix that depends on the
+//! relative heading.
 
 use protocol::Pose;
 use tch::nn::{self, Init};
 use tch::{Kind, TchError, Tensor};
 
-/// Name of the parameter in weights files. Those that were trained without it, alone or elsewhere, do not have it.
+/// Name of the parameter in weights files; absent in weights that were trained without it.
 pub(crate) const WEIGHT: &str = "steering.weight";
-/// 1, cos, sin, cos 2, sin 2 of the heading: directions turn with the first pair, axes (which look the same from both
-/// ends, as anchors do) with the second.
+/// 1, cos, sin, cos 2, sin 2 of the heading: directions rotate with the first pair, axes (which are the same from both
+/// ends, as anchors are) with the second.
 const BASIS: i64 = 5;
 
-/// Turns the channels of neighbours: `f + sum_k basis_k(heading) * W_k f`, then ReLU as after the encoder.
+/// Mixes the channels of neighbours: `f + sum_k basis_k(heading) * W_k f`, then ReLU as after the encoder.
 #[derive(Debug)]
 pub struct ChannelMixing {
     /// `[BASIS, C, C]`.
@@ -30,10 +31,11 @@ impl ChannelMixing {
         Self { weight }
     }
 
-    /// Turns maps `[N, C, H, W]` into the axes of the ego; those at the identity, the ego's own, stay as they are.
+    /// Converts feature maps `[N, C, H, W]` to the axes of the ego; those at the identity pose, the ego's own, are
+    /// unchanged.
     ///
     /// # Errors
-    /// [`TchError`] when the channels are not those it was made for, or there is not one pose per map.
+    /// [`TchError`] when the channels differ from its own, or there is not one pose per feature map.
     pub fn turn(&self, features: &Tensor, ego_from_cav: &[Pose]) -> Result<Tensor, TchError> {
         let mut turned = Vec::with_capacity(ego_from_cav.len());
         for (index, pose) in ego_from_cav.iter().enumerate() {
@@ -43,10 +45,10 @@ impl ChannelMixing {
         Tensor::f_cat(&turned, 0)
     }
 
-    /// The same of one map `[1, C, H, W]`.
+    /// The same for one feature map `[1, C, H, W]`.
     ///
     /// # Errors
-    /// [`TchError`] when the channels are not those it was made for.
+    /// [`TchError`] when the channels differ from its own.
     fn turn_one(&self, map: &Tensor, ego_from_cav: &Pose) -> Result<Tensor, TchError> {
         if *ego_from_cav == Pose::IDENTITY {
             return Ok(map.shallow_clone());
@@ -68,7 +70,7 @@ impl ChannelMixing {
         (map + change).f_relu()
     }
 
-    /// `[C, C]`: what is added of each channel to each.
+    /// `[C, C]`: weight of each channel in the sum that is added to each channel.
     fn matrix(&self, ego_from_cav: &Pose) -> Result<Tensor, TchError> {
         let yaw_rad = ego_from_cav.yaw_rad();
         let ((sin, cos), (sin_2, cos_2)) = (yaw_rad.sin_cos(), (2.0 * yaw_rad).sin_cos());
@@ -104,7 +106,7 @@ mod tests {
     #[test]
     fn only_neighbours_are_turned_and_only_by_their_heading() {
         let weight = Tensor::zeros([BASIS, 2, 2], FLOAT);
-        // Channel 0 gains sin(heading) of channel 1: what lay along y now also lies along x.
+        // Channel 0 gains sin(heading) of channel 1: a direction along y now has a part along x.
         let _ = weight.get(2).get(0).get(1).fill_(1.0);
         let steering = ChannelMixing { weight };
         let features = Tensor::ones([3, 2, 1, 1], FLOAT);

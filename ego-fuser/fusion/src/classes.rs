@@ -1,12 +1,12 @@
-//! Where on a map vehicles may be, as the detector's head says.
+//! Class head of the detector: likelihood of a vehicle at each cell of a feature map.
 
 use tch::nn::{self, Init};
 use tch::{TchError, Tensor};
 
-/// Before they are read or trained.
+/// Initial values before weights are read or trained.
 const RANDOM: Init = Init::Randn { mean: 0.0, stdev: 0.01 };
 
-/// The detector's head of classes.
+/// The detector's class head.
 #[derive(Debug)]
 pub(crate) struct Classes {
     weight: Tensor,
@@ -14,8 +14,8 @@ pub(crate) struct Classes {
 }
 
 impl Classes {
-    /// The head for maps of `channels` and cells of `anchors` whose parameters lie under `path`, which a detector that is
-    /// trained with the fusion has made; without one they are made here.
+    /// The head for feature maps of `channels` with `anchors` per cell whose parameters are under `path`. A detector
+    /// that is trained with the fusion has created them; otherwise they are created here.
     pub(crate) fn under(path: &nn::Path<'_>, [channels, anchors]: [i64; 2]) -> Self {
         let path = path / "cls_head";
         let of = |name: &str, size: &[i64]| path.get(name).unwrap_or_else(|| path.var(name, size, RANDOM));
@@ -27,8 +27,8 @@ impl Classes {
         Self { weight: self.weight.shallow_clone(), bias: self.bias.shallow_clone() }
     }
 
-    /// How likely a vehicle is around each cell of a map `[1, C, H, W]`: `[1, 1, H, W]`, the logit of its best anchor. No
-    /// gradient flows.
+    /// Likelihood of a vehicle around each cell of a feature map `[1, C, H, W]`: `[1, 1, H, W]`, the logit of the best
+    /// anchor of a cell. No gradient flows.
     pub(crate) fn likely(&self, map: &Tensor) -> Result<Tensor, TchError> {
         let [map, weight, bias] = [map, &self.weight, &self.bias].map(Tensor::f_detach);
         let logits = map?.f_permute([0, 2, 3, 1])?.f_linear(&weight?.f_flatten(1, 3)?, Some(&bias?))?;
@@ -46,7 +46,7 @@ mod tests {
     use crate::test_data::uniform;
 
     #[test]
-    fn it_is_the_head_that_lies_there_and_says_what_that_says() {
+    fn it_is_the_existing_head_and_gives_the_same_output() {
         let variables = VarStore::new(Device::Cpu);
         let head = DetectionHead::new(&variables.root(), 5, 2);
         let parameters = variables.variables().len();
@@ -57,9 +57,9 @@ mod tests {
         let likely = classes.likely(&map).unwrap();
         assert!(!likely.requires_grad() && likely.allclose(&scores, 1e-5, 1e-5, false));
         assert_eq!(likely.kind(), Kind::Float);
-        let alone = VarStore::new(Device::Cpu);
-        let _ = Classes::under(&alone.root(), [5, 2]);
-        let mut names: Vec<String> = alone.variables().into_keys().collect();
+        let separate = VarStore::new(Device::Cpu);
+        let _ = Classes::under(&separate.root(), [5, 2]);
+        let mut names: Vec<String> = separate.variables().into_keys().collect();
         names.sort();
         assert_eq!(names, ["cls_head.bias", "cls_head.weight"]);
     }

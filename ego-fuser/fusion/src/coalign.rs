@@ -1,8 +1,8 @@
-//! CoAlign (Lu et al., ICRA 2023): poses corrected by the boxes that agents have in common, then per-cell fusion.
+//! CoAlign (Lu et al., ICRA 2023): pose correction by common boxes, then per-cell fusion.
 //!
-//! The correction happens before maps are moved, see [`crate::pose_graph`]; what is left for the fusion is
-//! attention or the maximum. The published network has a residual backbone and fuses at each of its levels; that is
-//! `multi_scale`, for imported weights. Live, an agent sends one map, and it is fused once.
+//! The correction happens before feature maps are warped, see [`crate::pose_graph`]; the fusion itself is attention or
+//! the maximum. The published network has a residual backbone and fuses at each of its levels; that is `multi_scale`,
+//! for imported weights. Live, an agent sends one feature map, and it is fused once.
 
 use perception::model_config::{ConfigError, DetectorConfig};
 use serde::{Deserialize, Serialize};
@@ -28,11 +28,11 @@ pub static METHOD: MethodSpec = MethodSpec {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct CoAlignConfig {
-    /// How a cell's features become one.
+    /// Operation that fuses the features of a cell.
     pub aggregation: Aggregation,
-    /// What cells mean that have not come.
+    /// Value of cells that were not received.
     pub missing: Missing,
-    /// Correction of the poses; absent: poses are taken as they come.
+    /// Correction of the poses; absent: poses are used as received.
     pub pose_graph: Option<PoseGraphConfig>,
 }
 

@@ -1,9 +1,9 @@
-//! CoBEVT: swap fusion of the agents' maps.
+//! CoBEVT: swap fusion of the agents' feature maps.
 //!
-//! Xu et al., CoRL 2022, with the LiDAR configuration of OpenCOOD. The reference numbers agents by the order in which they
-//! come; here neighbours are numbered by their distance from the ego, so that the order in which messages arrive does not
-//! matter. Its mean over the slots takes empty ones in too; networks that are trained here take the mean over those that
-//! reach a cell, and need not compute the others. `count_missing` brings the published behaviour back.
+//! Xu et al., CoRL 2022, with the LiDAR configuration of OpenCOOD. The reference numbers agents in order of arrival;
+//! here neighbours are numbered by their distance from the ego, so that the order of arrival does not matter. Its mean
+//! over the slots includes empty ones; networks that are trained here take the mean over the slots that reach a cell,
+//! and need not compute the others. `count_missing` restores the published behaviour.
 
 use perception::model_config::{ConfigError, DetectorConfig};
 use tch::nn;
@@ -79,7 +79,7 @@ impl Fusion for Cobevt {
     }
 }
 
-/// `[N]`: the places of maps, the ego first and then by distance.
+/// `[N]`: indices of the maps, the ego first and then by distance.
 pub(super) fn nearest_first(metadata: &[MapMetadata]) -> Tensor {
     let distance = |index: &i64| {
         let [x, y, _] = metadata[*index as usize].ego_from_cav.translation_m;

@@ -1,9 +1,9 @@
-//! Convolutions whose input channels are taken in parts, and a GRU made of them.
+//! Convolution that can be applied to parts of its input channels, and a GRU built on it.
 
 use tch::nn::{self, Init};
 use tch::{TchError, Tensor};
 
-/// A convolution with bias that keeps the size of the map.
+/// A convolution with bias that keeps the size of the feature map.
 #[derive(Debug)]
 pub(super) struct Conv {
     /// `[out, in, k, k]`, or `[out, in]` for a layer that a reference applies to the last dimension.
@@ -42,7 +42,7 @@ impl Conv {
         convolve(x, &self.kernel()?, Some(&self.bias))
     }
 
-    /// What the input channels from `first` on contribute, where `x` holds just those.
+    /// Contribution of the input channels from `first` on, where `x` holds only those.
     pub(super) fn part(&self, x: &Tensor, first: i64, with_bias: bool) -> Result<Tensor, TchError> {
         let channels = x.size4()?.1;
         convolve(x, &self.kernel()?.f_narrow(1, first, channels)?, with_bias.then_some(&self.bias))
@@ -55,7 +55,7 @@ fn convolve(x: &Tensor, kernel: &Tensor, bias: Option<&Tensor>) -> Result<Tensor
     x.f_conv2d(&kernel, bias, [1, 1], [padding; 2], [1, 1], 1)
 }
 
-/// A convolutional GRU that is only ever asked for its first step.
+/// A convolutional GRU of which only the first step is computed.
 #[derive(Debug)]
 pub(super) struct ConvGru {
     cells: Vec<Cell>,
@@ -84,7 +84,7 @@ impl ConvGru {
         Self { cells: (0..layers).map(cell).collect(), hidden }
     }
 
-    /// The state `[N, hidden, H, W]` after `x` `[N, in, H, W]` has come to an empty one: `update * candidate`.
+    /// The state `[N, hidden, H, W]` after an input `x` `[N, in, H, W]` to an empty state: `update * candidate`.
     pub(super) fn first_state(&self, x: &Tensor) -> Result<Tensor, TchError> {
         let hidden = self.hidden;
         self.cells.iter().try_fold(x.shallow_clone(), |x, Cell { gates, candidate }| {

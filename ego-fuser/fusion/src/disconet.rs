@@ -1,7 +1,7 @@
-//! DiscoNet (Li et al., NeurIPS 2021): at every cell, a small network weighs each agent's features against the ego's.
+//! DiscoNet (Li et al., NeurIPS 2021): a small network weighs each agent's features against the ego's at every cell.
 //!
-//! The fusion of the published network. What it was taught by, a teacher that saw all points at once, is a way of
-//! training and not part of the network; weights trained here have had no teacher.
+//! The fusion of the published network. Its training by distillation, from a teacher with the points of all agents, is
+//! not part of the network; weights trained here had no teacher.
 
 use perception::layers::convolution::Norm;
 use perception::model_config::{ConfigError, DetectorConfig};
@@ -33,7 +33,7 @@ const NORM: (f64, f64) = (1e-5, 0.1);
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DiscoNetConfig {
-    /// Channels of the maps.
+    /// Channels of the feature maps.
     pub channels: i64,
     /// Channels of the layers before the weight.
     pub hidden: [i64; 3],
@@ -46,7 +46,7 @@ impl DiscoNetConfig {
         Self { channels, hidden: [128, 32, 8] }
     }
 
-    /// The same: the weights are the cheapest part of any network.
+    /// The same: the weighting network is the cheapest part of any network.
     #[must_use]
     pub fn lean(channels: i64) -> Self {
         Self::full(channels)
@@ -150,7 +150,7 @@ mod tests {
         network.fuse(&maps).unwrap().map.square().sum(Kind::Float).backward();
         for (name, variable) in variables.variables() {
             if variable.requires_grad() {
-                // A bias before a batch norm has no say.
+                // A bias before a batch norm has no effect.
                 let must_move = !(name.contains("conv1_") && name.ends_with("bias")) || name.contains("conv1_4");
                 let norm = variable.grad().abs().sum(Kind::Float).double_value(&[]);
                 assert!(norm.is_finite() && (norm > 0.0 || !must_move), "{name}: {norm}");

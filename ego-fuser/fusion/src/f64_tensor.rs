@@ -1,21 +1,21 @@
-//! Tensors as plain numbers, for loops that visit memory in an order that the tensor library does not.
+//! Tensor conversion: tensors as slices of floats, for loops whose memory order the tensor library does not offer.
 
 use tch::{Device, Kind, TchError, Tensor, nn};
 
-/// Cells that are transposed together; what they show fits into a core's nearest cache.
+/// Cells that are transposed together; their data fit into a core's L1 cache.
 pub(crate) const BLOCK: usize = 16;
 
-/// What a tensor of floats holds, row by row.
+/// Values of a float tensor, row-major.
 pub(crate) fn numbers(tensor: &Tensor) -> Result<Vec<f32>, TchError> {
     Vec::try_from(tensor.f_reshape(-1)?)
 }
 
-/// Whether loops over numbers may stand for the tensor library's operations.
+/// True if loops over plain floats may replace the tensor library's operations.
 pub(crate) fn are_numbers(tensor: &Tensor) -> bool {
     tensor.device() == Device::Cpu && tensor.kind() == Kind::Float && tensor.numel() > 0 && !tensor.requires_grad()
 }
 
-/// What a map `[C, H, W]` of floats holds, cell by cell: `[H * W, C]`.
+/// Values of a float map `[C, H, W]`, cell by cell: `[H * W, C]`.
 pub(crate) fn cells(map: &Tensor) -> Result<Vec<f32>, TchError> {
     let (channels, height, width) = map.size3()?;
     let cell_after_cell = map.f_permute([1, 2, 0])?;
@@ -34,8 +34,8 @@ pub(crate) fn cells(map: &Tensor) -> Result<Vec<f32>, TchError> {
     Ok(values)
 }
 
-/// `[1, C, H, W]` of a map `[C, H, W]`, its channels side by side in memory, as convolutions over few channels at a time are
-/// fastest; in the order it has where gradients flow.
+/// `[1, C, H, W]` of a map `[C, H, W]` with the channels of a cell contiguous in memory (channels last), the fastest
+/// layout for convolutions over few channels; the layout is unchanged where gradients flow.
 pub(crate) fn by_cell(map: &Tensor) -> Result<Tensor, TchError> {
     if !are_numbers(map) {
         return map.f_unsqueeze(0);
@@ -44,8 +44,7 @@ pub(crate) fn by_cell(map: &Tensor) -> Result<Tensor, TchError> {
     Tensor::f_from_slice(&cells(map)?)?.f_view([1, height, width, channels])?.f_permute([0, 3, 1, 2])
 }
 
-/// A convolution of single cells of maps `[N, C, H, W]`, in the order of memory that these have: where the channels of a cell lie
-/// side by side it is one product of matrices.
+/// A 1x1 convolution of maps `[N, C, H, W]` in their memory order: with channels last it is one matrix product.
 pub(crate) fn pointwise(convolution: &nn::Conv2D, maps: &Tensor) -> Result<Tensor, TchError> {
     let cells = maps.f_permute([0, 2, 3, 1])?;
     let (weight, bias) = (&convolution.ws, convolution.bs.as_ref());
@@ -55,7 +54,7 @@ pub(crate) fn pointwise(convolution: &nn::Conv2D, maps: &Tensor) -> Result<Tenso
     cells.f_linear(&weight.f_flatten(1, 3)?, bias)?.f_permute([0, 3, 1, 2])
 }
 
-/// `[1, C, H, W]` of a map `[C, H, W]` in the order that it has in memory, such that convolutions see that order.
+/// `[1, C, H, W]` of a map `[C, H, W]` in its memory order, such that convolutions use that order.
 pub fn as_batch(map: &Tensor) -> Result<Tensor, TchError> {
     map.f_permute([1, 2, 0])?.f_unsqueeze(0)?.f_permute([0, 3, 1, 2])
 }

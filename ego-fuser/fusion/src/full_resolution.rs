@@ -1,4 +1,4 @@
-//! Maps that are kept to the cell, and read at few.
+//! Full-resolution maps: earlier feature maps kept cell by cell and read at a few cells only.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -9,17 +9,17 @@ use tch::{Kind, TchError, Tensor};
 use crate::f64_tensor::{are_numbers, numbers};
 use crate::warp::{BILINEAR, Cells, NEAREST, PADDING_ZEROS, places_of};
 
-/// A map on the lattice of its sender, in axes of the ego.
+/// A feature map on the BEV grid of its sender, in axes of the ego.
 #[derive(Debug)]
 pub(crate) enum FullResolutionMap {
-    /// Numbers, where no gradient flows: a map is kept for several frames, and turned into numbers once.
+    /// Plain floats, where no gradient flows: a map is kept for several frames and converted once.
     Numbers {
-        /// What it shows.
+        /// Features.
         cells: Arc<Cells>,
         /// `[H * W]`, 1 where a cell was sent.
         sent: Arc<[f32]>,
     },
-    /// Tensors, where one does.
+    /// Tensors, where a gradient flows.
     Tensors {
         /// `[1, C, H, W]`.
         map: Tensor,
@@ -28,17 +28,17 @@ pub(crate) enum FullResolutionMap {
     },
 }
 
-/// What maps show at some cells of the ego.
+/// Features of maps at some cells of the ego.
 #[derive(Debug)]
 pub(crate) struct CellSamples {
-    /// `[R, C]`: zeros where they show nothing.
+    /// `[R, C]`: zeros where the maps have no data.
     pub(crate) features: Tensor,
-    /// `[R, 1]`, 1 where they show something.
+    /// `[R, 1]`, 1 where they have data.
     pub(crate) mask: Tensor,
 }
 
 impl FullResolutionMap {
-    /// Of a map `[1, C, H, W]`, none of whose numbers is below zero, and which of its cells were sent, `[1, 1, H, W]`; absent:
+    /// From a map `[1, C, H, W]` without negative values and the mask of cells that were sent, `[1, 1, H, W]`; absent:
     /// all.
     pub(crate) fn of(map: &Tensor, sent: Option<&Tensor>) -> Result<Self, TchError> {
         let sent = match sent {
@@ -59,8 +59,8 @@ impl FullResolutionMap {
         }
     }
 
-    /// What `maps` on `grid`, each with its time step and its sender's pose, show at some `cells` of the ego's lattice, by row and
-    /// column: by time step the most that any of them shows.
+    /// Features of `maps` on `grid`, each with its time step and its sender's pose, at some `cells` (row and column) of
+    /// the ego's grid: by time step the maximum over the maps.
     pub(crate) fn seen(
         maps: &[(usize, Pose, &Self)],
         cells: &[[usize; 2]],
@@ -77,14 +77,14 @@ impl FullResolutionMap {
         })
     }
 
-    /// What it shows at places in `grid_sampler`'s coordinates, two for each: `[R, C]`, and whether it does, `[R, 1]`.
+    /// Features at positions in `grid_sampler`'s coordinates, two for each: `[R, C]`, and their validity, `[R, 1]`.
     fn at(&self, places: &[f32]) -> Result<CellSamples, TchError> {
         let count = places.len() / 2;
         match self {
             Self::Numbers { cells, sent } => {
                 let channels = cells.channels();
                 let (mut features, mut mask) = (vec![0.0; count * channels], vec![0.0; count]);
-                cells.look(sent, places, |place, shown| {
+                cells.for_each_valid(sent, places, |place, shown| {
                     features[place * channels..][..channels].copy_from_slice(shown);
                     mask[place] = 1.0;
                 });
@@ -105,7 +105,7 @@ impl FullResolutionMap {
 }
 
 impl CellSamples {
-    /// The most of both.
+    /// Element-wise maximum of both.
     fn or(&self, other: &Self) -> Result<Self, TchError> {
         Ok(Self { features: self.features.f_maximum(&other.features)?, mask: self.mask.f_maximum(&other.mask)? })
     }
@@ -138,12 +138,12 @@ mod tests {
             FullResolutionMap::of(&map, Some(&sent.narrow(0, entry, 1))).unwrap()
         });
         let whole: Vec<FullResolutionMap> = whole.collect();
-        let told = entries.iter().map(|&(step, entry)| (step, poses()[entry], &whole[entry]));
-        FullResolutionMap::seen(&told.collect::<Vec<_>>(), cells, &GRID).unwrap()
+        let given = entries.iter().map(|&(step, entry)| (step, poses()[entry], &whole[entry]));
+        FullResolutionMap::seen(&given.collect::<Vec<_>>(), cells, &GRID).unwrap()
     }
 
     #[test]
-    fn numbers_and_tensors_show_what_a_warp_of_the_whole_map_does() {
+    fn numbers_and_tensors_agree_with_a_warp_of_the_whole_map() {
         let some: Vec<i64> = (0..16 * 32).filter(|cell| cell % 3 == 0).collect();
         let index = Tensor::from_slice(&some);
         let cells: Vec<[usize; 2]> = some.iter().map(|&cell| [cell as usize / 32, cell as usize % 32]).collect();
@@ -156,7 +156,7 @@ mod tests {
             let seen = seen(with_gradient, &[(0, 0), (1, 1), (0, 2)], &cells);
             assert!(seen.keys().eq(&[0, 1]));
             for ((seen, features), mask) in seen.values().zip(expected(&features)).zip(expected(&mask)) {
-                // A place between two cells may be nearest to either.
+                // At a position between two cells either may be the nearest.
                 let apart = |a: &Tensor, b: &Tensor| (a - b).abs().gt(1e-5).sum(Kind::Int64).int64_value(&[]);
                 assert!(apart(&seen.features, &features) <= 8 && apart(&seen.mask, &mask) <= 2);
                 assert!(seen.mask.sum(Kind::Float).double_value(&[]) > 50.0);

@@ -1,7 +1,6 @@
-//! The last maps of every vehicle, kept by the ego: nothing is sent twice.
+//! History: the last feature maps of every vehicle, kept by the ego so that nothing is sent twice.
 //!
-//! Each lies here with the pose that its sender had when it was made, so that it can be put where it belongs from
-//! wherever the ego is now.
+//! Each is stored with the pose that its sender had at capture, so that it can be warped to any later frame of the ego.
 
 use std::collections::{BTreeMap, VecDeque};
 
@@ -9,25 +8,25 @@ use protocol::{CavId, Pose};
 
 use crate::ReceivedMaps;
 
-/// Maps older than this tell of another situation, nanoseconds.
+/// Largest age of a feature map that is kept, nanoseconds.
 pub const MAX_AGE_NANOS: u64 = 1_000_000_000;
-/// Vehicles that are remembered at most.
+/// Largest number of vehicles in the history.
 const MAX_VEHICLES: usize = 64;
 
-/// A map as it came.
+/// A feature map as received.
 #[derive(Debug)]
 pub struct KeptMap {
-    /// When it was made, nanoseconds.
+    /// Capture time, nanoseconds.
     pub capture_nanos: u64,
-    /// Where its sender believed to be then.
+    /// Pose that its sender reported for that time.
     pub world_from_cav: Pose,
-    /// How sure it was.
+    /// Confidence of that pose, 0..1.
     pub confidence: f64,
     /// One map, as the fusion stage keeps it.
     pub map: ReceivedMaps,
 }
 
-/// Maps by vehicle, oldest first.
+/// Feature maps by vehicle, oldest first.
 #[derive(Debug)]
 pub struct History {
     frames: usize,
@@ -36,18 +35,18 @@ pub struct History {
 }
 
 impl History {
-    /// Keeps what a fusion of `frames` time steps asks for; with one there is nothing to keep.
+    /// History for a fusion of `frames` time steps; with one, nothing is kept.
     pub fn new(frames: usize) -> Self {
         Self { frames, kept: BTreeMap::new(), latest_nanos: 0 }
     }
 
-    /// Forgets everything: another scene begins.
+    /// Removes everything: another scene begins.
     pub fn clear(&mut self) {
         self.kept.clear();
         self.latest_nanos = 0;
     }
 
-    /// The ego's clock stands at `now_nanos`: what is too old goes, and all of it where the clock was turned back.
+    /// Sets the ego's clock to `now_nanos`: removes maps that are too old, and all where the clock went backwards.
     pub fn advance(&mut self, now_nanos: u64) {
         if now_nanos < self.latest_nanos {
             self.clear();
@@ -59,13 +58,13 @@ impl History {
         self.kept.retain(|_, maps| !maps.is_empty());
     }
 
-    /// The maps of a vehicle from before the one that is fused now, newest first: at most a time step each.
+    /// Maps of a vehicle from before the one that is fused now, newest first: at most one per time step.
     pub fn before(&self, cav: &CavId, capture_nanos: u64) -> impl Iterator<Item = &KeptMap> {
         let earlier = move |kept: &&KeptMap| kept.capture_nanos < capture_nanos;
         self.kept.get(cav).into_iter().flatten().rev().filter(earlier).take(self.frames.saturating_sub(1))
     }
 
-    /// Keeps a map for later. One that is kept already, as it served more than one frame, is not kept twice.
+    /// Keeps a map for later frames. A map that served more than one frame is kept once.
     pub fn keep(&mut self, cav: &CavId, kept: KeptMap) {
         let is_new = !self.kept.contains_key(cav);
         if self.frames < 2 || (is_new && self.kept.len() >= MAX_VEHICLES) {

@@ -1,4 +1,4 @@
-//! Interface of a fusion: aligned maps in, one map out.
+//! Interface of a fusion: aligned feature maps in, one feature map out.
 
 use std::fmt::Debug;
 
@@ -20,9 +20,9 @@ pub trait Fusion: Debug + Send {
 pub struct FusionOutput {
     /// `[C, H, W]` in the frame of the ego.
     pub map: Tensor,
-    /// `[N - 1, 3]`: shift of each entry but the first beyond its pose, those of [`AlignedMaps::earlier`] last: along x and y
-    /// of the ego, metres, and about the entry's sender, radians. Absent for methods that take poses as they are, and where
-    /// there is one entry.
+    /// `[N - 1, 3]`: shift of each entry but the first beyond its pose, those of [`AlignedMaps::earlier`] last: along x
+    /// and y of the ego, metres, and about the entry's sender, radians. Absent for methods that use poses as received,
+    /// and where there is one entry.
     pub corrections: Option<Tensor>,
 }
 

@@ -1,4 +1,4 @@
-//! The layers that transformers among the fusions are made of. Parameter names are those of the reference codes.
+//! Layers of the transformers among the fusions. Parameter names are those of the reference codes.
 //!
 //! Tokens lie along all dimensions but the last, which holds the channels.
 
@@ -8,8 +8,9 @@ use tch::{Kind, TchError, Tensor};
 /// Offset under the root in layer norms, as everywhere in the reference codes.
 const EPSILON: f64 = 1e-5;
 
-/// Spread of the weights that lead back to the residual path: small, so that an untrained transformer hands on what an
-/// encoder that is trained already has found, and yet not zero, so that everything behind them learns from the first step.
+/// Standard deviation of the weights that lead back to the residual path: small, so that an untrained transformer
+/// passes on the features of a trained encoder, and yet not zero, so that all layers after them get gradients from the
+/// first step.
 const RESIDUAL: Init = Init::Randn { mean: 0.0, stdev: 0.02 };
 
 /// `x W^T + b` over the last dimension.
@@ -17,7 +18,7 @@ const RESIDUAL: Init = Init::Randn { mean: 0.0, stdev: 0.02 };
 pub struct Linear {
     /// `[to, from]`, `weight`.
     pub weight: Tensor,
-    /// `[to]`, `bias`; nothing where the reference has none.
+    /// `[to]`, `bias`; absent where the reference has none.
     pub bias: Option<Tensor>,
 }
 
@@ -28,13 +29,13 @@ impl Linear {
         Self::with_init(path, from, to, has_bias, nn::init::DEFAULT_KAIMING_UNIFORM)
     }
 
-    /// The last layer of a branch that is added to the residual path: almost nothing at the start.
+    /// The last layer of a branch that is added to the residual path: nearly zero at the start.
     #[must_use]
     pub fn residual(path: &nn::Path<'_>, from: i64, to: i64, has_bias: bool) -> Self {
         Self::with_init(path, from, to, has_bias, RESIDUAL)
     }
 
-    /// Hands on what comes in at the start; as many channels leave as enter.
+    /// Identity at the start; as many channels leave as enter.
     #[must_use]
     pub fn identity(path: &nn::Path<'_>, channels: i64) -> Self {
         let linear = Self::with_init(path, channels, channels, true, Init::Const(0.0));
@@ -50,7 +51,7 @@ impl Linear {
     /// `[..., from]` to `[..., to]`.
     ///
     /// # Errors
-    /// [`TchError`] when the channels are others.
+    /// [`TchError`] when the number of channels differs.
     pub fn forward(&self, x: &Tensor) -> Result<Tensor, TchError> {
         x.f_linear(&self.weight, self.bias.as_ref())
     }
@@ -74,7 +75,7 @@ impl LayerNorm {
     /// `[..., channels]` to the same.
     ///
     /// # Errors
-    /// [`TchError`] when the channels are others.
+    /// [`TchError`] when the number of channels differs.
     pub fn forward(&self, x: &Tensor) -> Result<Tensor, TchError> {
         x.f_layer_norm(self.weight.size(), Some(&self.weight), Some(&self.bias), EPSILON, false)
     }
@@ -100,7 +101,7 @@ impl FeedForward {
     /// `[..., channels]` to the same.
     ///
     /// # Errors
-    /// [`TchError`] when the channels are others.
+    /// [`TchError`] when the number of channels differs.
     pub fn forward(&self, x: &Tensor, train: bool) -> Result<Tensor, TchError> {
         let hidden = dropout(self.wide.forward(x)?.f_gelu("none")?, self.dropout, train)?;
         dropout(self.back.forward(&hidden)?, self.dropout, train)
@@ -119,7 +120,7 @@ pub fn dropout(x: Tensor, share: f64, train: bool) -> Result<Tensor, TchError> {
 ///
 /// # Shapes
 /// - `query`: `[B, Q, M, D]`; `key`, `value`: `[B, K, M, D]`; the last dimension without gaps
-/// - `bias`: what can be spread over `[B, M, Q, K]`
+/// - `bias`: broadcastable to `[B, M, Q, K]`
 /// - returns: `[B, Q, M * D]`
 ///
 /// # Errors
@@ -134,8 +135,8 @@ pub fn attend(query: &Tensor, key: &Tensor, value: &Tensor, bias: Option<&Tensor
     seen.f_transpose(1, 2)?.f_reshape([groups, tokens, heads * channels])
 }
 
-/// The same step by step, on `[B, M, tokens, D]`: the fused kernels have no gradient for the bias, and what the library
-/// falls back to scales queries and keys in passes of their own.
+/// The same step by step, on `[B, M, tokens, D]`: the fused kernels have no gradient for the bias, and the library's
+/// fallback scales queries and keys in separate passes.
 fn attend_and_learn_bias(query: &Tensor, key: &Tensor, value: &Tensor, bias: &Tensor) -> Result<Tensor, TchError> {
     let (groups, heads, asking, channels) = query.size4()?;
     let asked = key.size()[2];
@@ -152,7 +153,7 @@ fn attend_and_learn_bias(query: &Tensor, key: &Tensor, value: &Tensor, bias: &Te
     weights.f_bmm(&flat(value, asked)?)?.f_view([groups, heads, asking, channels])
 }
 
-/// What is added to scores so that cells with a mask of zero are not attended to: 0 or minus infinity.
+/// Additive mask of the scores, so that cells with a mask of zero are not attended to: 0 or minus infinity.
 ///
 /// # Errors
 /// [`TchError`] of the tensor library.

@@ -1,7 +1,8 @@
-//! Fusion methods: many feature maps on the ego's grid, one feature map out.
+//! Fusion methods: several BEV feature maps on the ego's grid in, one feature map out. "Map" means BEV feature map in
+//! this crate.
 //!
-//! A method is one file here: its settings ([`FusionSettings`]), its module ([`Fusion`]) and its [`MethodSpec`], which is
-//! one line of the table in [`crate::method`].
+//! A method is one file here: its settings ([`FusionSettings`]), its module ([`Fusion`]) and its [`MethodSpec`], which
+//! is one line of the table in [`crate::method`].
 
 pub mod attention;
 mod block_order;

@@ -1,4 +1,5 @@
-//! Maps on their way to a fusion: as received, warped onto the ego's grid ([`WarpedMaps`]), and aligned with their metadata.
+//! Stages of feature maps before a fusion: as received, warped onto the ego's grid ([`WarpedMaps`]), aligned with
+//! metadata.
 
 use protocol::{BevGrid, Pose};
 use tch::{TchError, Tensor};
@@ -7,12 +8,12 @@ use super::classes::Classes;
 use super::full_resolution::FullResolutionMap;
 use crate::warp::WarpedMaps;
 
-/// Origin of one map.
+/// Origin of one feature map.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MapMetadata {
-    /// Agent that it is of, 0 being the ego. With history an agent has several maps.
+    /// Index of its agent, 0 being the ego. With history an agent has several maps.
     pub agent: usize,
-    /// Pose of its sender when it was made, in the frame of the ego now.
+    /// Pose of its sender at capture, in the current frame of the ego.
     pub ego_from_cav: Pose,
     /// Confidence of its sender's pose, 0..1.
     pub confidence: f64,
@@ -28,7 +29,7 @@ impl MapMetadata {
     }
 }
 
-/// Maps in the frames of their senders.
+/// Feature maps in the frames of their senders.
 #[derive(Debug)]
 pub struct ReceivedMaps {
     /// `[N, C, H, W]`.
@@ -61,7 +62,7 @@ impl ReceivedMaps {
     /// [`TchError`] when there are none, or of several sizes.
     pub fn together(all: &[&Self]) -> Result<Self, TchError> {
         let maps: Vec<&Tensor> = all.iter().map(|maps| &maps.maps).collect();
-        // Where one of them was sent as a whole, its mask has to be written out.
+        // If one of them was sent completely, its mask has to be written out.
         let sent = all.iter().any(|maps| maps.sent.is_some()).then(|| {
             let cells = |maps: &&Self| match &maps.sent {
                 Some(sent) => Ok(sent.shallow_clone()),
@@ -81,9 +82,9 @@ impl ReceivedMaps {
     }
 }
 
-/// The maps of one sample on the ego's grid: the input of a fusion. The first is the ego's newest.
+/// The feature maps of one sample on the ego's grid: the input of a fusion. The first is the ego's newest.
 ///
-/// Missing agents are either not in it or have a mask of zeros: both mean the same to every method.
+/// Missing agents are either absent or have a mask of zeros: both are equivalent for every method.
 #[derive(Debug)]
 pub struct AlignedMaps {
     /// `N` maps on the ego's grid; the mask is 1 everywhere for the ego.
@@ -97,13 +98,13 @@ pub struct AlignedMaps {
     /// Maps from before each agent's newest, for a method that needs them with larger cells, see
     /// [`HistorySpec`](super::HistorySpec).
     pub earlier: Option<EarlierMaps>,
-    /// Whether parameters are learnt from this pass: some values are left out at random then.
+    /// True during training: some values are then dropped at random.
     pub is_training: bool,
 }
 
 impl AlignedMaps {
-    /// The newest maps of all agents, outside of training: `features` `[N, C, H, W]` and `mask` `[N, 1, H, W]` on the ego's
-    /// grid, which count as received there too.
+    /// The newest maps of all agents, outside training: `features` `[N, C, H, W]` and `mask` `[N, 1, H, W]` on the
+    /// ego's grid; the same tensors stand for the maps as received.
     #[must_use]
     pub fn newest(features: &Tensor, mask: &Tensor, metadata: &[MapMetadata], grid: &BevGrid) -> Self {
         Self {
@@ -116,7 +117,7 @@ impl AlignedMaps {
         }
     }
 
-    /// How many agents have a newest map here, or maps of any age where earlier ones are not apart.
+    /// Number of agents with a newest map, or of maps of any age where earlier ones are not separate.
     ///
     /// # Errors
     /// [`TchError`] when the features have not four dimensions.
@@ -132,11 +133,11 @@ pub struct EarlierMaps {
     pub warped: WarpedMaps,
     /// `O`: their origins.
     pub metadata: Vec<MapMetadata>,
-    /// The same at full resolution and not warped yet, and the head that says where on a map vehicles may be.
+    /// The same at full resolution and not warped yet, and the class head that gives the likelihood of vehicles.
     pub(crate) full_resolution: Option<(Vec<FullResolutionMap>, Classes)>,
 }
 
-/// Maps `[N, C, H, W]` with cells of `cells` by `cells`, each their mean; those at the edges of fewer.
+/// Maps `[N, C, H, W]` pooled to cells of `cells` by `cells`, each their mean; those at the edges of fewer.
 pub(crate) fn larger_cells(maps: &Tensor, cells: i64) -> Result<Tensor, TchError> {
     let (.., height, width) = maps.size4()?;
     if cells == 1 {
@@ -156,21 +157,22 @@ fn sum_of_every(maps: &Tensor, dim: i64, count: i64) -> Result<Tensor, TchError>
     (1..count).try_fold(every(0)?, |sum, first| sum.f_add(&every(first)?))
 }
 
-/// The grid of such maps.
+/// The grid of pooled maps.
 pub(crate) fn with_cells_of(grid: &BevGrid, cells: i64) -> BevGrid {
     let cells = cells as u32;
     let (width, height) = (grid.width.div_ceil(cells), grid.height.div_ceil(cells));
     BevGrid { cell_m: grid.cell_m * f64::from(cells), width, height, ..*grid }
 }
 
-/// The entries of `mask` `[N, 1, H, W]` that reach any cell, and the ego's, the first.
+/// Indices of the entries of `mask` `[N, 1, H, W]` that reach any cell, and of the ego's, the first.
 pub(crate) fn present(mask: &Tensor) -> Result<Vec<i64>, TchError> {
     let most = mask.f_amax([1i64, 2, 3].as_slice(), false)?.f_to_kind(tch::Kind::Float)?;
     let most = Vec::<f32>::try_from(most.f_to_device(tch::Device::Cpu)?)?;
     Ok((0i64..).zip(most).filter(|(entry, most)| *entry == 0 || *most > 0.0).map(|(entry, _)| entry).collect())
 }
 
-/// Splits agents of all samples into padded samples: `[sum(agents), ...]` to `[B, longest, ...]` and a mask `[B, longest]`.
+/// Splits agents of all samples into padded samples: `[sum(agents), ...]` to `[B, longest, ...]` and a mask
+/// `[B, longest]`.
 ///
 /// # Errors
 /// [`TchError`] when the counts do not add up to the first size, or one is above `longest`.

@@ -1,4 +1,4 @@
-//! F-Cooper: the largest value over the agents, channel by channel, cell by cell.
+//! F-Cooper: element-wise maximum over the agents.
 
 use perception::model_config::{ConfigError, DetectorConfig};
 use serde::{Deserialize, Serialize};
@@ -52,6 +52,6 @@ pub(super) fn maximum(WarpedMaps { features, mask }: &WarpedMaps) -> Result<Tens
     if features.size4()?.0 == 1 {
         return features.f_get(0);
     }
-    // Zero is a value like any other to the maximum, so cells out of reach must fall below all of them.
+    // Zero is an ordinary value for the maximum, so cells out of reach must be below all values.
     features.f_masked_fill(&mask.f_eq(0.0)?, f64::NEG_INFINITY)?.f_amax([0i64].as_slice(), false)
 }

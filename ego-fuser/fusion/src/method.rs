@@ -54,7 +54,7 @@ methods! {
 }
 
 impl Method {
-    /// A method that is not in the table: it is known to this process by its handle alone.
+    /// A method that is not in the table: this process reaches it only by its handle.
     #[must_use]
     pub const fn of(spec: &'static MethodSpec) -> Self {
         Self(spec)
@@ -84,7 +84,7 @@ impl Method {
         self.0.exchange
     }
 
-    /// Content that the ego needs of its own sweep: that of its messages, and its feature map where it is alone.
+    /// Content that the ego needs of its own sweep: that of its messages, and its feature map for ego-only operation.
     #[must_use]
     pub const fn own_content(self) -> Exchange {
         match self.exchange() {
@@ -93,7 +93,7 @@ impl Method {
         }
     }
 
-    /// Cells of their maps that agents send unless configured otherwise; absent: all.
+    /// Selection of the cells that agents send unless configured otherwise; absent: all cells.
     #[must_use]
     pub const fn gate(self) -> Option<ConfidenceGate> {
         self.0.gate
@@ -114,7 +114,7 @@ impl Method {
         (self.0.fusion.default_config)(detector)
     }
 
-    /// Whether settings are of its fusion.
+    /// True if the settings belong to its fusion.
     #[must_use]
     pub fn has_fusion(self, config: &FusionConfig) -> bool {
         self.0.fusion.kind == config.kind()
@@ -186,7 +186,7 @@ impl<'de> Deserialize<'de> for Method {
     }
 }
 
-/// On command lines the names are listed by `--help` and where another is given.
+/// For command lines: `--help` and the error for an unknown name list the names.
 impl ValueParserFactory for Method {
     type Parser = TryMapValueParser<PossibleValuesParser, fn(String) -> Result<Self, UnknownMethod>>;
 
@@ -201,7 +201,7 @@ impl<'de> Deserialize<'de> for FusionConfig {
         let mut fields = serde_json::Map::deserialize(deserializer)?;
         let kind = fields.remove("kind").ok_or_else(|| D::Error::missing_field("kind"))?;
         let fusion = Method::ALL.map(|method| method.spec().fusion).into_iter().find(|fusion| kind == fusion.kind);
-        let fusion = fusion.ok_or_else(|| D::Error::custom(format_args!("no fusion is of kind {kind}")))?;
+        let fusion = fusion.ok_or_else(|| D::Error::custom(format_args!("unknown kind of fusion {kind}")))?;
         (fusion.parse)(fields.into()).map_err(D::Error::custom)
     }
 }

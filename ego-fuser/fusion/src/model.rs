@@ -1,4 +1,4 @@
-//! The whole network of a method, encoder to head, for training and for the ego's half of inference.
+//! Cooperative model: the whole network of a method, encoder to head, for training and for the ego's half of inference.
 
 mod stage;
 
@@ -32,7 +32,7 @@ pub use stage::{FusionStage, StageError};
 /// Metadata key of the method that weights were trained with.
 pub const METHOD_KEY: &str = "method";
 
-/// Why a model cannot be built, loaded or run.
+/// Error of building, loading or running a model.
 #[derive(Debug, thiserror::Error)]
 pub enum ModelError {
     /// No network can be built from the configuration.
@@ -44,38 +44,38 @@ pub enum ModelError {
     /// The weights name a method that is not known.
     #[error(transparent)]
     Method(#[from] UnknownMethod),
-    /// Maps do not fit the lattice.
+    /// Feature maps do not fit the BEV grid.
     #[error(transparent)]
     Warp(#[from] WarpError),
-    /// The tensor library refused.
+    /// The tensor library reported an error.
     #[error("model: {0}")]
     Torch(#[from] TchError),
     /// The head's output does not fit the anchors.
     #[error(transparent)]
     Decode(#[from] DecodeError),
-    /// Facts and views do not add up.
-    #[error("{views} views encoded, but the samples name {told}")]
+    /// Numbers of metadata entries and views differ.
+    #[error("{views} views encoded, but the samples have metadata of {told}")]
     ViewCount {
         /// Feature maps.
         views: i64,
-        /// Facts over all samples.
+        /// Metadata entries over all samples.
         told: usize,
     },
 }
 
-/// What a model makes of a batch.
+/// Output of a model for a batch.
 #[derive(Debug)]
 pub struct CooperativeOutput {
     /// Scores and boxes of every anchor.
     pub head: HeadOutput,
-    /// For each sample the shifts of its maps by the fusion, see [`FusionOutput::corrections`].
+    /// For each sample the corrections of its maps by the fusion, see [`FusionOutput::corrections`].
     pub corrections: Vec<Option<Tensor>>,
 }
 
 /// Encoder, fusion and head of one method under one set of variables.
 #[derive(Debug)]
 pub struct CooperativeModel {
-    /// Which method it was built for.
+    /// Method that it was built for.
     pub method: Method,
     /// Every variable, by the names of the weights file.
     pub variables: VarStore,
@@ -104,7 +104,7 @@ impl CooperativeModel {
         device: Device,
     ) -> Result<Self, ModelError> {
         if config.y_axis == YAxis::Right {
-            // Samples and targets are of this world.
+            // Samples and targets are right-handed; a mirrored network cannot be trained.
             let (field, value) = ("y_axis", "right".to_owned());
             return Err(ConfigError::Value { field, value, must: "left to train" }.into());
         }
@@ -144,13 +144,13 @@ impl CooperativeModel {
             None => stored_config(weights, method, &config)?,
         };
         let model = Self::with_fusion(&config, method, &fusion, device)?;
-        // A network that was trained alone becomes a cooperative one whose fusion has everything to learn.
+        // A single-vehicle network becomes a cooperative one whose fusion is untrained.
         let is_fusion = |name: &str| name == channel_mixing::WEIGHT || name.starts_with(FUSION_PREFIX);
         weights.copy_some_into(&model.variables, |name| !is_fusion(name) || weights.contains(name))?;
         Ok(model)
     }
 
-    /// What the header of its weights says of it: configuration, method and fusion.
+    /// Metadata for the header of its weights file: configuration, method and fusion.
     #[must_use]
     pub fn about(&self) -> BTreeMap<String, String> {
         let config = serde_json::to_string(&self.network.config).expect("a configuration is JSON");
@@ -161,7 +161,7 @@ impl CooperativeModel {
             .into()
     }
 
-    /// The numbers it was built from.
+    /// Configuration of the detector.
     #[must_use]
     pub fn config(&self) -> &DetectorConfig {
         &self.network.config
@@ -173,18 +173,18 @@ impl CooperativeModel {
         &self.network
     }
 
-    /// In which numbers the convolutions compute from now on.
+    /// Sets the precision of the convolutions.
     pub fn set_precision(&mut self, precision: ComputePrecision) {
         self.network.compute = precision.kind();
     }
 
-    /// Where the variables are.
+    /// Device of the variables.
     #[must_use]
     pub fn device(&self) -> Device {
         self.variables.device()
     }
 
-    /// How it makes one map of many.
+    /// The fusion stage.
     #[must_use]
     pub fn fusion(&self) -> &FusionStage {
         &self.fusion
@@ -192,10 +192,10 @@ impl CooperativeModel {
 
     /// The forward pass of a training step: all views are encoded together, then fused sample by sample.
     ///
-    /// `facts` tell of each sample's views, ego first; views lie in `pillars` in the same order.
+    /// `facts` are the metadata of each sample's views, ego first; `pillars` has the views in the same order.
     ///
     /// # Errors
-    /// [`ModelError`] when facts and views do not add up.
+    /// [`ModelError`] when the numbers of facts and views differ.
     pub fn forward(
         &self,
         pillars: &PillarBatch,
@@ -206,10 +206,10 @@ impl CooperativeModel {
         self.fuse_and_detect(&self.network.through_compressor(&features, train), facts, train)
     }
 
-    /// The rest of the forward pass, from the maps of all views `[sum(views), C, H, W]` on, each in its own frame.
+    /// Second half of the forward pass, from the maps of all views `[sum(views), C, H, W]` on, each in its own frame.
     ///
     /// # Errors
-    /// [`ModelError`] when facts and views do not add up.
+    /// [`ModelError`] when the numbers of facts and views differ.
     pub fn fuse_and_detect(
         &self,
         features: &Tensor,
@@ -240,8 +240,9 @@ impl CooperativeModel {
         Ok(CooperativeOutput { head: self.network.heads(&Tensor::f_stack(&fused, 0)?)?, corrections })
     }
 
-    /// What agents would have sent of their maps `[N, C, H, W]`, for a method in which they choose: in training a random
-    /// share of the cells that they are surest of, so that every threshold is learnt for. The ego has all of its own.
+    /// Mask of the cells of maps `[N, C, H, W]` that agents would have sent, for a method in which they select: in
+    /// training a random share of the most confident cells, so that every threshold is learnt. The ego keeps all of its
+    /// own.
     fn sent_in_training(&self, features: &Tensor) -> Result<Option<Tensor>, TchError> {
         let agents = features.size4()?.0;
         if !self.fusion.requirements().partial_maps_in_training || agents < 2 {
@@ -256,7 +257,7 @@ impl CooperativeModel {
         })
     }
 
-    /// Boxes of every sample of a head's output, cleaned up by `limits`.
+    /// Boxes of every sample of a head's output, post-processed by `limits`.
     ///
     /// # Errors
     /// [`ModelError::Decode`] when the output does not fit the anchors.
@@ -276,13 +277,13 @@ impl CooperativeModel {
             .collect()
     }
 
-    /// The limits of the clean-up that go with this network: boxes lie wholly over its area.
+    /// Post-processing limits of this network: boxes lie completely over its area.
     #[must_use]
     pub fn limits(&self) -> PostprocessConfig {
         PostprocessConfig::for_detector(self.config())
     }
 
-    /// What finds the targets of a frame among the anchors of the head.
+    /// The assigner of a frame's targets to the anchors of the head.
     ///
     /// # Errors
     /// [`LatticeError`] when the configuration has no anchors.

@@ -1,4 +1,4 @@
-//! Methods without fusion of feature maps: the ego alone, boxes and points.
+//! Methods without fusion of feature maps: ego-only, late (boxes) and early (points).
 
 use perception::model_config::{ConfigError, DetectorConfig};
 use serde::{Deserialize, Serialize};
@@ -9,10 +9,10 @@ use super::maps::AlignedMaps;
 use super::settings::FusionSettings;
 use super::spec::{Exchange, FusionSpec, MethodSpec};
 
-/// The ego alone: the baseline that every exchange must beat.
+/// Ego-only, no collaboration: the baseline of every method.
 pub static NONE: MethodSpec = MethodSpec {
     name: "none",
-    summary: "the ego alone",
+    summary: "ego-only, no collaboration",
     exchange: Exchange::Nothing,
     gate: None,
     runs_with_weights_of: &[],
@@ -56,7 +56,7 @@ impl FusionSettings for OwnConfig {
     }
 }
 
-/// The ego's own map, whatever the others have.
+/// The ego's own feature map, whatever the others send.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct NoFusion;
 

@@ -1,4 +1,4 @@
-//! Cells around a map, so that windows of any size cover it whole.
+//! Padding: cells around a feature map, so that windows of any size cover it completely.
 
 use tch::{TchError, Tensor};
 
@@ -12,19 +12,19 @@ pub(super) struct Padding {
 }
 
 impl Padding {
-    /// What a map of `[N, C, H, W]` lacks to multiples of `edge`.
+    /// Padding of maps `[N, C, H, W]` to multiples of `edge`.
     pub(super) fn to_multiples(maps: &Tensor, edge: i64) -> Result<Self, TchError> {
         let (_, _, height, width) = maps.size4()?;
         let [below, right] = [height, width].map(|length| (edge - length % edge) % edge);
         Ok(Self { height, width, below, right })
     }
 
-    /// Whether nothing is lacking.
+    /// True if no padding is needed.
     pub(super) fn is_empty(self) -> bool {
         (self.below, self.right) == (0, 0)
     }
 
-    /// Rows and columns with it.
+    /// Rows and columns including the padding.
     pub(super) fn size(self) -> [i64; 2] {
         [self.height + self.below, self.width + self.right]
     }
@@ -42,8 +42,8 @@ impl Padding {
         Self::to_multiples(maps, cells)?.maps(maps, 0)
     }
 
-    /// The same for a mask `[N, 1, H, W]`: there is nothing to be seen of neighbours beyond the edge, but the ego has to
-    /// look at something, and looks at itself.
+    /// The same for a mask `[N, 1, H, W]`: padded cells are invalid for neighbours and valid for the ego, as attention
+    /// needs at least one valid token.
     pub(super) fn mask(self, mask: &Tensor, slots: i64) -> Result<Tensor, TchError> {
         if self.is_empty() && slots == 0 {
             return Ok(mask.shallow_clone());
@@ -69,7 +69,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_added_is_seen_by_the_ego_alone_and_cut_off_again() {
+    fn padding_is_valid_for_the_ego_only_and_is_cropped() {
         let maps = Tensor::ones([2, 3, 5, 8], (Kind::Float, Device::Cpu));
         let padding = Padding::to_multiples(&maps, 4).unwrap();
         assert_eq!(padding.size(), [8, 8]);

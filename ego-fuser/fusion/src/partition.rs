@@ -1,8 +1,8 @@
-//! Maps cut into groups of cells that attend to one another.
+//! Partition: splits a feature map into groups of cells that attend to one another.
 
 use tch::{TchError, Tensor};
 
-/// How a map is cut into groups of `window * window` cells.
+/// Partition of a feature map into groups of `window * window` cells.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Partition {
     /// Neighbouring cells.
@@ -27,7 +27,7 @@ impl Partition {
         cut.f_reshape([rows * columns, slots, window * window, channels])
     }
 
-    /// The way back of [`Self::cut`].
+    /// Inverse of [`Self::cut`].
     pub(super) fn map(self, groups: &Tensor, [height, width]: [i64; 2], window: i64) -> Result<Tensor, TchError> {
         let &[_, slots, _, channels] = &groups.size()[..] else { return Err(shape_error(groups)) };
         let groups = groups.f_view([height / window, width / window, slots, window, window, channels])?;
@@ -40,7 +40,7 @@ impl Partition {
 }
 
 pub(super) fn shape_error(found: &Tensor) -> TchError {
-    TchError::Shape(format!("swap fusion has no use for {:?}", found.size()))
+    TchError::Shape(format!("swap fusion does not support maps of shape {:?}", found.size()))
 }
 
 #[cfg(test)]

@@ -1,12 +1,12 @@
-//! The motion of an upright vehicle that fits pairs of points best: heading and shift, no slope.
+//! Planar fit: the motion of an upright vehicle (heading and translation, no slope) that fits pairs of points best.
 
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector2, Vector3};
 
-/// Below this spread of the points about their mean the heading is free, metres.
+/// Below this spread of the points about their mean the heading is undetermined, metres.
 const MIN_SPREAD_M: f64 = 0.1;
 
-/// `target_from_source` from pairs of (source, target), metres, with the least sum of squared horizontal residuals; height is
-/// the mean difference. `None` when the points lie on one place or there is none.
+/// `target_from_source` from pairs of (source, target), metres, with the least sum of squared horizontal residuals;
+/// height is the mean difference. `None` when the points lie on one place or there is none.
 pub fn fit<I>(pairs: &I) -> Option<Isometry3<f64>>
 where
     I: Iterator<Item = (Vector3<f64>, Vector3<f64>)> + Clone,

@@ -1,4 +1,5 @@
-//! Fusion settings: the trait that a method implements for its own, and [`FusionConfig`], which holds those of any method.
+//! Fusion settings: the trait that a method implements for its own, and [`FusionConfig`], which holds those of any
+//! method.
 
 use std::any::Any;
 use std::fmt::Debug;
@@ -15,7 +16,7 @@ use crate::pose_graph::PoseGraphConfig;
 /// Metadata key of the fusion's settings in a weights file.
 pub const FUSION_KEY: &str = "fusion";
 
-/// Maps with more channels are fused by modules of full size.
+/// Feature maps with more channels are fused by modules of full size.
 const LEAN_CHANNELS: i64 = 128;
 
 /// The settings that a method's fusion is built from.
@@ -43,9 +44,9 @@ pub trait FusionSettings: Debug + Clone + PartialEq + Serialize + DeserializeOwn
 pub struct Requirements {
     /// Maps of earlier time steps.
     pub history: HistorySpec,
-    /// Correction of the poses by boxes before maps are warped; absent: poses are taken as they come.
+    /// Correction of the poses by boxes before maps are warped; absent: poses are used as received.
     pub pose_graph: Option<PoseGraphConfig>,
-    /// Whether training hides cells of the maps at random, as agents choose at run time which to send.
+    /// True if training hides cells of the maps at random, as agents select at run time which to send.
     pub partial_maps_in_training: bool,
 }
 
@@ -54,10 +55,10 @@ pub struct Requirements {
 pub struct HistorySpec {
     /// Time steps of every agent, the newest included.
     pub frames: usize,
-    /// Edge of the squares of cells whose mean is kept of an earlier map, cells; absent: earlier maps are kept as they are and
-    /// come among the newest.
+    /// Edge of the squares of cells that are pooled in an earlier map, cells; absent: earlier maps are not pooled and
+    /// are listed among the newest.
     pub earlier_cells: Option<i64>,
-    /// Whether earlier maps are needed at full resolution too.
+    /// True if earlier maps are needed at full resolution too.
     pub full_resolution: bool,
 }
 
@@ -130,7 +131,7 @@ impl PartialEq for FusionConfig {
     }
 }
 
-/// [`FusionSettings`] of a type that is not known.
+/// [`FusionSettings`] with the type erased.
 trait AnySettings: Debug + Send + Sync {
     fn kind(&self) -> &'static str;
     fn as_any(&self) -> &dyn Any;

@@ -20,8 +20,8 @@ pub enum Exchange {
     Features,
 }
 
-/// A collaboration method. A `static` of this type and its line in the table of [`crate::method`] are all that the rest of
-/// the program needs of a method.
+/// A collaboration method. A `static` of this type and its line in the table of [`crate::method`] are all that the rest
+/// of the program needs of a method.
 #[derive(Debug)]
 pub struct MethodSpec {
     /// Name on the command line, in scenarios, weights files and results.
@@ -30,7 +30,7 @@ pub struct MethodSpec {
     pub summary: &'static str,
     /// Content of its messages.
     pub exchange: Exchange,
-    /// Cells of their maps that agents send unless configured otherwise; absent: all.
+    /// Selection of the cells that agents send unless configured otherwise; absent: all cells.
     pub gate: Option<ConfidenceGate>,
     /// Names of the methods whose weights it runs with, best first; empty: only its own.
     pub runs_with_weights_of: &'static [&'static str],

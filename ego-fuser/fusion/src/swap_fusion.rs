@@ -1,7 +1,8 @@
-//! Swap fusion (fused axial attention), the fusion of CoBEVT: attention over all agents within windows, then within grids.
+//! Swap fusion (fused axial attention), the fusion of CoBEVT: attention over all agents within windows, then within
+//! grids.
 //!
 //! A window is a square of neighbouring cells; a grid is as many cells spread evenly over the whole map. Tokens of both
-//! are those of all agents, and scores are moved by a table over the offset between agents, rows and columns.
+//! are those of all agents; a bias table over the offset between agents, rows and columns is added to the scores.
 
 use perception::model_config::ConfigError;
 use serde::{Deserialize, Serialize};
@@ -11,7 +12,7 @@ use tch::{Device, Kind, TchError, Tensor};
 use super::layers::{FeedForward, LayerNorm, Linear, attend, dropout, unseen};
 use super::partition::{Partition, shape_error};
 
-/// Tokens that are computed at once outside of training: what lies between two steps then stays in the cache.
+/// Tokens that are computed at once outside training: intermediate results then stay in the cache.
 const CHUNK: i64 = 1280;
 
 /// Sizes of swap fusion.
@@ -22,7 +23,7 @@ pub struct SwapFusionConfig {
     pub channels: i64,
     /// Layers, each of window and grid attention.
     pub depth: usize,
-    /// Agents that the table of offsets is made for.
+    /// Agents that the table of offsets covers.
     pub slots: i64,
     /// Cells along an edge of a window.
     pub window: i64,
@@ -30,14 +31,14 @@ pub struct SwapFusionConfig {
     pub head_channels: i64,
     /// Channels inside the feed-forward networks.
     pub hidden: i64,
-    /// Whether empty slots are computed and count in the mean at the end: for published weights.
+    /// True if empty slots are computed and count in the mean at the end: for published weights.
     pub count_missing: bool,
-    /// Share of values left out in training.
+    /// Share of values dropped in training.
     pub dropout: f64,
 }
 
 impl SwapFusionConfig {
-    /// The published sizes, for maps of `channels` (256 there).
+    /// The published sizes, for feature maps of `channels` (256 there).
     #[must_use]
     pub fn full(channels: i64) -> Self {
         Self {
@@ -52,8 +53,8 @@ impl SwapFusionConfig {
         }
     }
 
-    /// For live traffic on two cores: two layers, heads as wide as the published ones, nothing left out
-    /// (drawing what to leave out costs as much as a layer norm and a projection).
+    /// For live traffic on two cores: two layers, heads as wide as the published ones, no dropout (drawing its mask
+    /// costs as much as a layer norm and a projection).
     #[must_use]
     pub fn lean(channels: i64) -> Self {
         Self { depth: 2, head_channels: (channels / 2).max(1), dropout: 0.0, ..Self::full(channels) }
@@ -73,7 +74,7 @@ impl SwapFusionConfig {
             ("fusion.hidden", self.hidden, 4096),
         ];
         if let Some((field, size, _)) = sizes.into_iter().find(|(_, size, most)| !(1..=*most).contains(size)) {
-            return Err(ConfigError::Value { field, value: size.to_string(), must: "at least 1 and not absurd" });
+            return Err(ConfigError::Value { field, value: size.to_string(), must: "at least 1 and plausible" });
         }
         if self.channels % self.head_channels != 0 {
             let value = self.head_channels.to_string();
@@ -87,7 +88,7 @@ impl SwapFusionConfig {
     }
 }
 
-/// What is added to scores for the offset between two tokens of a group: agents, rows and columns.
+/// Learnt bias of the scores for the offset between two tokens of a group: agents, rows and columns.
 #[derive(Debug)]
 pub(super) struct OffsetTable {
     slots: i64,
@@ -110,7 +111,7 @@ impl OffsetTable {
         }
     }
 
-    /// `[M, asking * cells, asked * cells]` added to the scores. Agents further apart than the table knows count as its end.
+    /// `[M, asking * cells, asked * cells]` added to the scores. Agents beyond the table's range use its last entry.
     pub(super) fn bias(&self, asking: i64, asked: i64) -> Result<Tensor, TchError> {
         let (span, last) = (2 * self.window - 1, self.slots - 1);
         let tokens = |slots: i64| {
@@ -151,7 +152,7 @@ impl GroupAttention {
         }
     }
 
-    /// `[G, S, P, C]` to the same, of which the first `asked` slots are looked at.
+    /// `[G, S, P, C]` to the same, of which the first `asked` slots are attended to.
     fn forward(&self, x: &Tensor, asked: i64, bias: &Tensor, train: bool) -> Result<Tensor, TchError> {
         let &[groups, slots, _, channels] = &x.size()[..] else { return Err(shape_error(x)) };
         let heads = |part: &Tensor| part.f_unflatten(-1, [self.heads, channels / self.heads]);
@@ -159,7 +160,7 @@ impl GroupAttention {
         let parts = if asked == slots {
             flat(&self.to_qkv.forward(x)?)?.f_split(channels, 2)?
         } else {
-            // Slots that nobody looks at have no keys and values.
+            // Slots that are not attended to have no keys and values.
             let weight = &self.to_qkv.weight;
             let query = flat(&x.f_linear(&weight.f_narrow(0, 0, channels)?, None::<Tensor>)?)?;
             let there = x.f_narrow(1, 0, asked)?.f_contiguous()?;
@@ -171,7 +172,7 @@ impl GroupAttention {
     }
 }
 
-/// Attention and a feed-forward network over one partition, each normalised first and added to what it started from.
+/// Attention and a feed-forward network over one partition, each with pre-norm and a residual.
 #[derive(Debug)]
 pub(super) struct HalfBlock {
     partition: Partition,
@@ -202,7 +203,7 @@ impl HalfBlock {
         Ok(&x + self.feed_forward.forward(&self.feed_norm.forward(&x)?, train)?)
     }
 
-    /// On all groups of a map `[S, H, W, C]` at once, by moves that gradients go back through quickly: the groups.
+    /// On all groups of a map `[S, H, W, C]` at once, by operations with fast gradients: the groups.
     pub(super) fn whole(&self, map: &Tensor, slots: Slots<'_>, window: i64, train: bool) -> Result<Tensor, TchError> {
         let x = self.partition.cut(map, window)?;
         let bias = self.attention.offsets.bias(x.size()[1], slots.asked)?.f_unsqueeze(0)?;
@@ -214,19 +215,19 @@ impl HalfBlock {
     }
 }
 
-/// What of the slots counts.
+/// Validity of the slots.
 #[derive(Debug, Clone, Copy)]
 pub struct Slots<'a> {
-    /// The first slots hold agents that are there; only those are looked at.
+    /// The first slots hold present agents; only those are attended to.
     pub asked: i64,
-    /// `[S, H, W]` 1 where a map reaches, 0 elsewhere; nothing: all reach everywhere.
+    /// `[S, H, W]` 1 where a map reaches, 0 elsewhere; absent: all reach everywhere.
     pub reach: Option<&'a Tensor>,
-    /// Whether slots that are empty, or do not reach a cell, count in the mean at the end, as they do in the reference.
+    /// True if slots that are empty, or do not reach a cell, count in the mean at the end, as they do in the reference.
     pub count_missing: bool,
 }
 
 impl Slots<'_> {
-    /// `[G, 1, 1, asked * P]`: 0 for tokens that are there, minus infinity for those that are not.
+    /// `[G, 1, 1, asked * P]`: 0 for valid tokens, minus infinity for invalid ones.
     pub(super) fn unseen(&self, partition: Partition, window: i64) -> Result<Option<Tensor>, TchError> {
         let Some(reach) = self.reach else { return Ok(None) };
         let unseen = unseen(&reach.f_narrow(0, 0, self.asked)?.f_unsqueeze(3)?)?;
@@ -245,7 +246,7 @@ impl MeanHead {
     pub(super) fn new(path: &nn::Path<'_>, channels: i64) -> Self {
         Self {
             norm: LayerNorm::new(&(path / 2), channels),
-            // What the encoder has found is worth more than a random mixture of it.
+            // Identity: the encoder's features are worth more than a random mixture of them.
             linear: Linear::identity(&(path / 3), channels),
         }
     }
@@ -275,8 +276,8 @@ pub struct SwapFusion {
 }
 
 impl SwapFusion {
-    /// Variables `layers` and `mlp_head` below `path`. `config` is valid; `masked` says which of the two networks of the
-    /// reference the names are of.
+    /// Variables `layers` and `mlp_head` below `path`. `config` is valid; `masked` selects which of the two networks of
+    /// the reference the names belong to.
     #[must_use]
     pub fn new(path: &nn::Path<'_>, config: &SwapFusionConfig, masked: bool) -> Self {
         let mut halves = Vec::with_capacity(2 * config.depth);
@@ -298,7 +299,7 @@ impl SwapFusion {
         }
     }
 
-    /// Number of agents that its table of offsets was made for.
+    /// Number of agents that its table of offsets covers.
     #[must_use]
     pub fn slots(&self) -> i64 {
         self.slots
@@ -339,7 +340,7 @@ impl SwapFusion {
         lies_in.map_or_else(|| Ok(x.shallow_clone()), |partition| partition.map(&x, size, self.window))
     }
 
-    /// The same some groups at a time, gathered from wherever they lie.
+    /// The same some groups at a time, gathered from their places in memory.
     fn chunked(
         &self,
         half: &HalfBlock,
@@ -380,7 +381,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_cannot_be_built_is_named() {
+    fn invalid_settings_are_named() {
         assert!(SwapFusionConfig::full(256).validate().is_ok());
         assert!(SwapFusionConfig::lean(64).validate().is_ok());
         let message = |config: SwapFusionConfig| config.validate().unwrap_err().to_string();

@@ -1,16 +1,16 @@
-//! Training targets: which anchors are objects, and what each has to regress.
+//! Training targets: assigns anchors to objects and encodes the regression of each.
 //!
 //! The rule of OpenCOOD's label generator: overlap of axis-aligned boxes with one metre added to every side, positive
 //! above 0.6 or where an anchor is some object's best, negative below 0.45, the band between unassigned. Overlaps are
-//! computed in `f32` in the reference's order of operations, because anchors that lie wholly inside an object tie, and
-//! rounding decides which of them is its best.
+//! computed in `f32` in the reference's order of operations, because anchors that lie completely inside an object tie,
+//! and rounding decides which of them is its best.
 
 use protocol::Box3d;
 
 /// Numbers of one box that the head predicts: x, y, z, h, w, l, yaw.
 pub const BOX_CODE: usize = 7;
 
-/// Overlaps that decide between object and background.
+/// Overlap thresholds between object and background.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TargetRule {
     /// Above it an anchor is an object.
@@ -25,12 +25,12 @@ impl Default for TargetRule {
     }
 }
 
-/// An anchor that stands for an object.
+/// A positive anchor.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Positive {
     /// Flat index of the anchor, in the order row, column, anchor of the cell.
     pub anchor: usize,
-    /// What the head has to predict there: x, y, z, h, w, l, yaw, encoded relative to the anchor.
+    /// Regression target: x, y, z, h, w, l, yaw, encoded relative to the anchor.
     pub code: [f64; BOX_CODE],
 }
 
@@ -45,11 +45,11 @@ pub struct Labels {
     pub unassigned: Vec<usize>,
 }
 
-/// Why anchors cannot be used.
+/// Error of the anchors of a head.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum LatticeError {
     /// The number of anchors is not the product of the shape.
-    #[error("{found} anchors do not fill a lattice of {height} x {width} x {per_cell}")]
+    #[error("{found} anchors do not fill a grid of {height} x {width} x {per_cell}")]
     Count {
         /// Anchors given.
         found: usize,
@@ -60,15 +60,15 @@ pub enum LatticeError {
         /// Anchors of a cell.
         per_cell: usize,
     },
-    /// Centres do not grow with row and column, so objects cannot be looked up.
-    #[error("anchor {index} breaks the lattice: x must grow with the column and y with the row, and nothing else")]
+    /// Centres do not increase with row and column, so objects cannot be looked up.
+    #[error("anchor {index} breaks the order of the grid: x must increase with the column only, y with the row only")]
     NotSeparable {
-        /// Flat index of the first anchor off the lattice.
+        /// Flat index of the first anchor that breaks the order.
         index: usize,
     },
 }
 
-/// Finds the targets of a frame among the anchors of a head.
+/// Assigns the objects of a frame to the anchors of a head.
 #[derive(Debug, Clone)]
 pub struct TargetAssigner {
     rule: TargetRule,
@@ -85,7 +85,7 @@ impl TargetAssigner {
     /// Prepares `anchors`, flat in the order row (y), column (x), anchor of the cell; `shape` is `[H, W, A]`.
     ///
     /// # Errors
-    /// [`LatticeError`] when the anchors do not fill the shape or do not lie on a lattice.
+    /// [`LatticeError`] when the anchors do not fill the shape or are not on a grid.
     pub fn new(anchors: Vec<Box3d>, shape: [usize; 3], rule: TargetRule) -> Result<Self, LatticeError> {
         let [height, width, per_cell] = shape;
         if anchors.len() != height * width * per_cell || anchors.is_empty() {
@@ -112,7 +112,7 @@ impl TargetAssigner {
     #[must_use]
     pub fn assign(&self, objects: &[Box3d]) -> Labels {
         const FREE: u32 = u32::MAX;
-        // Per anchor: the first object it overlaps enough, and whether anything keeps it from being background.
+        // Per anchor: the first object it overlaps enough, and whether it may be background.
         let mut owner = vec![FREE; self.anchors.len()];
         let mut near = vec![false; self.anchors.len()];
         let mut best = Vec::with_capacity(objects.len());
@@ -153,7 +153,7 @@ impl TargetAssigner {
 
     /// Visits the anchors that can overlap `object`, by rising index.
     fn for_each_near(&self, object: &Box3d, mut visit: impl FnMut(usize)) {
-        // The added metre, and a little for the rounding to f32.
+        // The added metre, and a margin for the rounding to f32.
         let reach = self.reach + object.size_m[0].hypot(object.size_m[1]) / 2.0 + 1.01;
         let within = |centers: &[f64], middle: f64| {
             centers.partition_point(|&at| at < middle - reach)..centers.partition_point(|&at| at <= middle + reach)
@@ -166,8 +166,8 @@ impl TargetAssigner {
     }
 }
 
-/// What the head predicts for `object` at `anchor`: offsets by the anchor's diagonal and height, logarithms of size
-/// ratios, plain difference of yaw.
+/// Encoding of `object` at `anchor`: offsets by the anchor's diagonal and height, logarithms of size ratios, plain
+/// difference of yaw.
 #[must_use]
 pub fn encode(object: &Box3d, anchor: &Box3d) -> [f64; BOX_CODE] {
     let [l, w, h] = object.size_m;
@@ -293,7 +293,7 @@ mod tests {
     }
 
     #[test]
-    fn anchors_off_a_lattice_are_refused() {
+    fn anchors_off_a_grid_are_rejected() {
         let mut anchors = lattice(4, 5);
         let error = TargetAssigner::new(anchors.clone(), [4, 4, 2], TargetRule::default()).unwrap_err();
         assert!(matches!(error, LatticeError::Count { found: 40, .. }));

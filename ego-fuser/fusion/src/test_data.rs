@@ -1,4 +1,4 @@
-//! Made-up tensors for tests, the same in every run: torch's own generator is shared by all tests of a process.
+//! Synthetic tensors for tests, the same in every run: torch's own generator is shared by all tests of a process.
 
 use rand::{Rng as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
@@ -12,7 +12,7 @@ pub(crate) fn uniform(seed: u64, shape: &[i64]) -> Tensor {
     Tensor::from_slice(&values).view(shape)
 }
 
-/// Draws every parameter anew whose name has one of `parts`, from -`size` to `size`.
+/// Redraws every parameter whose name has one of `parts`, from -`size` to `size`.
 pub(crate) fn redraw(variables: &VarStore, parts: &[&str], size: f64) {
     let mut named: Vec<_> = variables.variables().into_iter().collect();
     named.sort_by(|a, b| a.0.cmp(&b.0));

@@ -1,9 +1,10 @@
-//! V2VNet (Wang et al., ECCV 2020): vehicles as the nodes of a graph that send each other messages for some rounds.
+//! V2VNet (Wang et al., ECCV 2020): a graph neural network whose nodes are vehicles that exchange messages for some
+//! rounds.
 //!
-//! In each round every node gets everyone's map in its own frame, makes a message of each pair with a convolution, takes
-//! their mean or maximum, and updates its map with a convolutional GRU. As in OpenCOOD and CoAlign the GRU begins every
-//! round with an empty state: its reset gate and all weights that look at the state have no effect, and are neither
-//! multiplied here nor trained.
+//! In each round every node gets the maps of all nodes in its own frame, computes a message for each pair with a
+//! convolution, takes their mean or maximum, and updates its map with a convolutional GRU. As in OpenCOOD and CoAlign
+//! the GRU begins every round with an empty state: its reset gate and all weights on the state have no effect, and are
+//! neither multiplied here nor trained.
 
 use perception::model_config::{ConfigError, DetectorConfig};
 use protocol::{BevGrid, Pose};
@@ -29,7 +30,7 @@ pub static METHOD: MethodSpec = MethodSpec {
     fusion: FusionSpec::of::<V2vNetConfig>(),
 };
 
-/// How a node takes its messages together.
+/// Aggregation of a node's messages.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Aggregation {
@@ -47,7 +48,7 @@ pub struct V2vNetConfig {
     pub channels: i64,
     /// Rounds of messages.
     pub rounds: usize,
-    /// How messages are taken together.
+    /// Aggregation of messages.
     pub aggregation: Aggregation,
     /// Layers of the GRU; 0: a message is added to the map as it is.
     pub gru_layers: usize,
@@ -62,8 +63,8 @@ impl V2vNetConfig {
         Self { channels, rounds: 2, aggregation: Aggregation::Mean, gru_layers: 1, kernel: 3 }
     }
 
-    /// One round: with N vehicles the round before the last costs N times as much as the last, for what neighbours have
-    /// heard of each other.
+    /// One round: with N vehicles the round before the last costs N times as much as the last, for the messages between
+    /// neighbours.
     #[must_use]
     pub fn lean(channels: i64) -> Self {
         Self { rounds: 1, ..Self::full(channels) }
@@ -103,14 +104,14 @@ pub struct V2vNet {
     mlp: Conv,
 }
 
-/// How every node's map lies in the frame of one of them.
+/// Transforms from every node's map to the frame of one node.
 #[derive(Debug)]
 pub struct Incoming {
     /// `[N, 2, 3]` from coordinates -1..1 of the receiver to those of each sender.
     pub theta: Tensor,
-    /// Whether -1 and 1 are the centres of the outer cells, rather than their edges.
+    /// True if -1 and 1 are the centres of the outer cells, false for their edges.
     pub corners_aligned: bool,
-    /// `[N, 1, H, W]`: where each sender's messages count.
+    /// `[N, 1, H, W]`: validity of each sender's messages.
     pub mask: Tensor,
 }
 
@@ -141,7 +142,7 @@ impl V2vNet {
     pub fn propagate(&self, maps: &Tensor, incoming: &[Incoming]) -> Result<Tensor, TchError> {
         let mut nodes = maps.shallow_clone();
         for round in 1..=self.config.rounds {
-            // Of the last round only the ego's update is of use.
+            // Of the last round only the ego's update is used.
             let receivers = if round == self.config.rounds { 1 } else { incoming.len() };
             nodes = self.round(&nodes, &incoming[..receivers])?;
         }
@@ -151,24 +152,24 @@ impl V2vNet {
     fn round(&self, nodes: &Tensor, incoming: &[Incoming]) -> Result<Tensor, TchError> {
         let channels = self.config.channels;
         let receivers = nodes.f_narrow(0, 0, incoming.len() as i64)?;
-        // The convolution over a pair is the sum of one over the sender and one over the receiver, which is the same for
-        // all its senders.
+        // The convolution over a pair is the sum of one over the sender and one over the receiver, which is the same
+        // for all its senders.
         let of_receivers = self.message.part(&receivers, channels, true)?;
-        let mut heard = Vec::with_capacity(incoming.len());
+        let mut aggregated = Vec::with_capacity(incoming.len());
         for (index, incoming) in incoming.iter().enumerate() {
             let arrived = incoming.warp(nodes)?;
             let of_receiver = of_receivers.f_narrow(0, index as i64, 1)?;
             let messages = (self.message.part(&arrived, 0, false)? + of_receiver) * &incoming.mask;
-            heard.push(match self.config.aggregation {
+            aggregated.push(match self.config.aggregation {
                 Aggregation::Mean => messages.f_mean_dim([0i64].as_slice(), true, messages.kind())?,
                 Aggregation::Max => messages.f_amax([0i64].as_slice(), true)?,
             });
         }
-        let heard = Tensor::f_cat(&heard, 0)?;
+        let aggregated = Tensor::f_cat(&aggregated, 0)?;
         if self.config.gru_layers == 0 {
-            return Ok(receivers + heard);
+            return Ok(receivers + aggregated);
         }
-        self.gru.first_state(&Tensor::f_cat(&[receivers, heard], 1)?)
+        self.gru.first_state(&Tensor::f_cat(&[receivers, aggregated], 1)?)
     }
 }
 
@@ -179,7 +180,8 @@ impl Incoming {
         maps.f_grid_sampler(&lattice, BILINEAR, PADDING_ZEROS, self.corners_aligned)
     }
 
-    /// What comes to `receiver` from all, by the poses of their maps; `reach` is known for the ego and computed for others.
+    /// Incoming maps of `receiver` from all, by the poses of their maps; `reach` is given for the ego and computed for
+    /// others.
     fn between(
         receiver: usize,
         nodes: &[MapMetadata],
@@ -206,8 +208,8 @@ impl Incoming {
 }
 
 impl Fusion for V2vNet {
-    /// Agents whose map does not reach the ego at all are no nodes of the graph. Between two neighbours all of a map
-    /// counts, cells that were not sent as zeros.
+    /// Agents whose map does not reach the ego at all are no nodes of the graph. Between two neighbours the complete
+    /// map is used, cells that were not sent as zeros.
     fn fuse(&self, aligned: &AlignedMaps) -> Result<FusionOutput, TchError> {
         let AlignedMaps { warped, received, metadata, grid, .. } = aligned;
         let entries = present(&warped.mask)?;
@@ -243,10 +245,10 @@ mod tests {
     }
 
     #[test]
-    fn a_neighbour_of_a_neighbour_is_heard_after_two_rounds_only() {
+    fn a_neighbour_of_a_neighbour_has_an_effect_after_two_rounds_only() {
         let grid = BevGrid { x_min_m: -12.0, y_min_m: -2.0, cell_m: 1.0, width: 24, height: 4 };
         let facts: Vec<_> = (0..3).map(|agent| MapMetadata::fresh(agent, Pose::IDENTITY)).collect();
-        // Of the third the ego has one cell in a corner, and what it has to say lies elsewhere.
+        // The third node's map reaches the ego at one cell in a corner, and its features lie elsewhere.
         let mask = Tensor::ones([3, 1, 4, 24], FLOAT);
         let _ = mask.get(2).narrow(2, 1, 23).fill_(0.0);
         let fused = |config: &V2vNetConfig, third: f64| {
@@ -256,15 +258,15 @@ mod tests {
             let maps = AlignedMaps::newest(&own_frame, &mask, &facts, &grid);
             no_grad(|| network.fuse(&maps)).unwrap().map
         };
-        for (rounds, is_heard) in [(1, false), (2, true)] {
+        for (rounds, has_effect) in [(1, false), (2, true)] {
             let config = V2vNetConfig { rounds, ..V2vNetConfig::full(4) };
             let difference = (fused(&config, 0.0) - fused(&config, 3.0)).abs().max().double_value(&[]);
-            assert_eq!(difference > 1e-5, is_heard, "{rounds} rounds: {difference}");
+            assert_eq!(difference > 1e-5, has_effect, "{rounds} rounds: {difference}");
         }
     }
 
     #[test]
-    fn what_cannot_be_built_is_refused() {
+    fn invalid_settings_are_rejected() {
         let variables = VarStore::new(Device::Cpu);
         for config in [
             V2vNetConfig { rounds: 0, ..V2vNetConfig::full(4) },

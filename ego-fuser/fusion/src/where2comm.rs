@@ -1,8 +1,8 @@
-//! Where2comm (Hu et al., NeurIPS 2022): agents send the cells around which they see vehicles, and nothing else.
+//! Method Where2comm (Hu et al., NeurIPS 2022): agents send only the cells around likely vehicles.
 //!
-//! What is sent is decided by each agent before its message, see [`protocol::ConfidenceGate`]; the fusion is per-cell
-//! attention or the maximum over what has come. In training, where nothing crosses the air, a random share of the most
-//! confident cells is kept instead of those above a threshold, as published.
+//! Each agent selects cells before it sends, see [`protocol::ConfidenceGate`]; the fusion is per-cell attention or the
+//! maximum over the received cells. In training, without a link, a random share of the most confident cells is kept
+//! instead of those above a threshold, as published.
 //!
 //! The published networks fuse at several levels of the backbone; that is `multi_scale`, for imported weights.
 
@@ -31,11 +31,11 @@ pub static METHOD: MethodSpec = MethodSpec {
     fusion: FusionSpec::of::<Where2commConfig>(),
 };
 
-/// Twice the published threshold: `lean` heads put the background just above that one. On validation scenes a fifth of the
-/// bytes is left then, and AP@0.5 is what it was.
+/// Twice the published threshold: `lean` heads score the background just above that one. On validation scenes a fifth
+/// of the bytes is left then, and AP@0.5 is unchanged.
 const GATE: ConfidenceGate = ConfidenceGate { threshold: 0.02, smoothing: Some(Smoothing { kernel: 5, sigma: 1.0 }) };
 
-/// How a cell's features become one.
+/// Operation that fuses the features of a cell.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Aggregation {
@@ -45,15 +45,15 @@ pub enum Aggregation {
     Max,
 }
 
-/// What a cell means that has not come, because it was not sent or lies beyond the sender's map.
+/// Value of a cell that was not received, because it was not sent or lies beyond the sender's map.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Missing {
-    /// Nothing: the agent does not take part there.
+    /// No value: the agent does not take part there.
     #[default]
     Absent,
-    /// Features of zero, as in the published code: attention to them dilutes what the others have. Imported weights were
-    /// trained like that.
+    /// Features of zero, as in the published code: attention to them dilutes the features of the others. Imported
+    /// weights were trained with this.
     Zero,
 }
 
@@ -61,15 +61,15 @@ pub enum Missing {
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Where2commConfig {
-    /// How a cell's features become one.
+    /// Operation that fuses the features of a cell.
     pub aggregation: Aggregation,
-    /// What cells mean that have not come.
+    /// Value of cells that were not received.
     #[serde(default)]
     pub missing: Missing,
 }
 
 impl Default for Where2commConfig {
-    /// Attention over those who have sent.
+    /// Attention over the agents that sent the cell.
     fn default() -> Self {
         Self { aggregation: Aggregation::Attention, missing: Missing::Absent }
     }
@@ -125,7 +125,7 @@ impl Fusion for Where2comm {
 pub struct CommunicationConfig {
     /// Smoothed confidence that a cell must exceed to be sent.
     pub threshold: f64,
-    /// How confidence is spread to the surroundings first.
+    /// Spatial smoothing of the confidence before the threshold.
     pub smoothing: Option<Smoothing>,
 }
 
@@ -141,7 +141,7 @@ impl Communication {
     /// The window is `gaussian_filter.*` below `path`; it is not trained.
     ///
     /// # Errors
-    /// [`ConfigError`] when it has no middle.
+    /// [`ConfigError`] when the size of the window is even.
     pub fn new(path: &nn::Path<'_>, config: &CommunicationConfig) -> Result<Self, ConfigError> {
         let window = config.smoothing.map(|Smoothing { kernel, .. }| {
             let kernel = i64::from(kernel);
@@ -153,7 +153,7 @@ impl Communication {
         Ok(Self { threshold: config.threshold, window: window.transpose()? })
     }
 
-    /// Which cells each agent would send: logits `[N, A, H, W]` to `[N, 1, H, W]` of 0 and 1.
+    /// Mask of the cells that each agent would send: logits `[N, A, H, W]` to `[N, 1, H, W]` of 0 and 1.
     ///
     /// # Errors
     /// [`TchError`] when the shape is another.
@@ -195,7 +195,7 @@ mod tests {
     const FLOAT: (Kind, Device) = (Kind::Float, Device::Cpu);
 
     #[test]
-    fn missing_cells_dilute_attention_only_where_told() {
+    fn missing_cells_dilute_attention_only_if_configured() {
         let mask = Tensor::ones([2, 1, 1, 2], FLOAT);
         let _ = mask.get(1).narrow(2, 1, 1).fill_(0.0);
         let features = Tensor::ones([2, 3, 1, 2], FLOAT) * &mask;

@@ -1,7 +1,7 @@
-//! How much of an offset between two vehicles a method's own alignment takes away.
+//! Alignment error: the part of a known pose offset between two vehicles that a method's own alignment leaves.
 //!
-//! An offset of known size is put on the true pose of a neighbour, in a direction that a seed draws; what the method would
-//! move the neighbour's map by is put on top, and both poses are compared with the true one.
+//! An offset of known size is added to the true pose of a neighbour, in a direction drawn by a seed; the method's
+//! correction of the neighbour's map is applied to it, and both poses are compared with the true one.
 
 use std::f64::consts::TAU;
 
@@ -21,13 +21,13 @@ use fusion::model::{FusionStage, METHOD_KEY, StageError};
 use fusion::warp::WarpError;
 use fusion::{MapMetadata, ReceivedMaps};
 
-/// Why nothing is measured.
+/// Reason why nothing is measured.
 #[derive(Debug, thiserror::Error)]
 pub enum ResidualError {
     /// The weights are not readable.
     #[error(transparent)]
     Weights(#[from] WeightsError),
-    /// The detector refused.
+    /// The detector reported an error.
     #[error(transparent)]
     Detector(#[from] DetectorError),
     /// The weights name a method that is not known.
@@ -42,15 +42,15 @@ pub enum ResidualError {
     /// Maps cannot be aligned.
     #[error(transparent)]
     Warp(#[from] WarpError),
-    /// The tensor library refused.
+    /// The tensor library reported an error.
     #[error("residual: {0}")]
     Torch(#[from] tch::TchError),
-    /// There is nothing to measure.
-    #[error("the fusion of these weights aligns nothing by itself")]
+    /// The fusion has no alignment to measure.
+    #[error("the fusion of these weights has no alignment of its own")]
     NoAlignment,
 }
 
-/// An offset put on the pose of a neighbour.
+/// An offset added to the pose of a neighbour.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Offset {
     /// Distance, metres.
@@ -62,13 +62,13 @@ pub struct Offset {
 /// Errors of relative poses before and after a method's own alignment.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Residual {
-    /// What was put on true poses.
+    /// Offset added to true poses.
     pub offset: Offset,
     /// Pairs of vehicles.
     pub pairs: usize,
-    /// Mean distance from the true place before and after, metres.
+    /// Mean distance from the true position before and after, metres.
     pub mean_m: [f64; 2],
-    /// Its median.
+    /// Median of the same, metres.
     pub p50_m: [f64; 2],
     /// Mean angle before and after, degrees.
     pub mean_deg: [f64; 2],
@@ -81,7 +81,7 @@ pub struct ResidualMeter {
     fusion: FusionStage,
 }
 
-/// Two maps, and where the second belongs.
+/// Two maps, and the true pose of the second.
 struct Pair {
     maps: Tensor,
     ego_from_cav: Pose,
@@ -99,11 +99,11 @@ impl ResidualMeter {
         Ok(Self { detector, fusion })
     }
 
-    /// Measures on every `every`-th tick of scenarios, the first vehicle being the ego; the same directions for the same
-    /// seed.
+    /// Measures on every `every`-th tick of scenarios, the first vehicle being the ego; the same directions for the
+    /// same seed.
     ///
     /// # Errors
-    /// [`ResidualError`] at the first frame that cannot be read, and when the fusion aligns nothing by itself.
+    /// [`ResidualError`] at the first frame that cannot be read, and when the fusion has no alignment of its own.
     pub fn measure(
         &mut self,
         scenarios: &[Scenario],
@@ -125,7 +125,7 @@ impl ResidualMeter {
         Ok(offsets.iter().zip(&errors).map(|(offset, errors)| summary(offset, errors)).collect())
     }
 
-    /// The ego with each of its neighbours in reach.
+    /// The ego with each of its neighbours in range.
     fn pairs(&mut self, scenario: &Scenario, tick: usize) -> Result<Vec<Pair>, ResidualError> {
         let ego = scenario.load(0, tick, &LoadOptions::default())?;
         let Some(world_from_ego) = ego.world_from_lidar else { return Ok(Vec::new()) };
@@ -144,7 +144,7 @@ impl ResidualMeter {
         Ok(pairs)
     }
 
-    /// The map `[1, C, H, W]` of a sweep as others get it.
+    /// The map `[1, C, H, W]` of a sweep as other vehicles receive it.
     fn map(&mut self, points: &PointCloud) -> Result<Tensor, DetectorError> {
         let encoded = self.detector.encode(points)?.features;
         self.detector.through_compressor(&encoded)
@@ -168,7 +168,7 @@ impl ResidualMeter {
     }
 }
 
-/// A pose shifted along the ego's axes and turned about its own place.
+/// A pose shifted along the ego's axes and rotated about its own position.
 fn moved(pose: &Pose, [dx, dy, turn_rad]: [f64; 3]) -> Pose {
     let [x, y, z] = pose.translation_m;
     Pose::from_xyz_yaw([x + dx, y + dy, z], pose.yaw_rad() + turn_rad)

@@ -1,8 +1,8 @@
-//! A method on recorded scenes, frame by frame, through the same code and the same messages as in a live run.
+//! Offline evaluation: a method on recorded scenes, frame by frame, with the code and messages of a live run.
 //!
-//! Every vehicle runs an [`Agent`]; what it would publish is encoded, weighed and decoded again; the [`Ego`] detects.
-//! Nothing is lost, and nothing is late unless asked for, so a live run paced like that gives the same boxes. With
-//! [`Evaluator::with_link`] messages cross the emulated air in virtual time ([`stepped`]).
+//! Every vehicle runs an [`Agent`]; its messages are encoded, measured and decoded again; the [`Ego`] detects. Nothing
+//! is lost, and nothing is late unless configured, so a live run at that pace gives the same boxes. With
+//! [`Evaluator::with_link`] messages pass through the link emulation in simulation time ([`stepped`]).
 
 pub mod alignment;
 mod error;
@@ -41,48 +41,48 @@ use sent::{Sent, stamp, view};
 use stepped::{RemotePool, SteppedConfig, VehicleConfig};
 use sweeps::Sweep;
 
-/// What to evaluate.
+/// Configuration of an evaluation.
 #[derive(Debug, Clone)]
 pub struct EvaluateConfig {
     /// Weights of encoder and head.
     pub weights: PathBuf,
-    /// The method; absent: the one the weights name.
+    /// The method; absent: that of the weights.
     pub method: Option<Method>,
-    /// Where the vehicles' poses come from.
+    /// Source of the vehicles' poses.
     pub pose_source: PoseSourceConfig,
-    /// How maps are encoded; without a gate the method's own holds.
+    /// Encoding of maps; without a gate the method's own is used.
     pub codec: CodecConfig,
-    /// What neighbours fit theirs to. There is no queue to watch here.
+    /// Rate control of neighbours. There is no queue to observe here.
     pub rate: RateConfig,
-    /// Whose messages and annotations count, and which objects; absent: vehicles wholly over the area of the network,
-    /// of all agents within 70 m.
+    /// Evaluation protocol: agents whose messages and annotations count, and objects that count; absent: vehicles
+    /// completely over the area of the network, of all agents within 70 m.
     pub protocol: Option<EvaluationProtocol>,
-    /// How long messages of neighbours are under way, nanoseconds: the ego fuses the newest that are at least so old.
+    /// Delay of neighbours' messages, nanoseconds: the ego fuses the newest that are at least this old.
     pub delay_nanos: u64,
-    /// Neighbours that lie; absent: none.
+    /// Attacking neighbours; absent: none.
     pub attack: Option<AttackConfig>,
-    /// Whether the ego leaves out neighbours that it does not trust.
+    /// Misbehaviour detection of the ego; absent: off.
     pub trust: Option<MisbehaviourConfig>,
 }
 
-/// One frame of the ego with everything it can be judged by.
+/// One frame of the ego with all data for its evaluation.
 #[derive(Debug, Clone)]
 pub struct EvaluatedFrame {
     /// Tick of the scenario.
     pub tick: usize,
-    /// Who spoke for the result, and for which capture time.
+    /// Sender and capture time of the result.
     pub stamp: Stamp,
-    /// What the ego would have published.
+    /// Detections that the ego would have published.
     pub result: Detections,
     /// The frames of all vehicles that take part, the ego first: true poses and annotations.
     pub frames: Vec<Frame>,
-    /// Where each of them believes to be.
+    /// Reported pose of each of them.
     pub poses: Vec<PoseEstimate>,
     /// The objects that count, in the ego's LiDAR frame.
     pub objects: Vec<Box3d>,
 }
 
-/// What all neighbours sent at one tick; nothing where none takes part.
+/// Messages of all neighbours at one tick; empty where none takes part.
 #[derive(Debug)]
 struct SentAtOnce {
     capture_nanos: u64,
@@ -96,17 +96,17 @@ pub struct Evaluator {
     weights: Weights,
     ego: Ego,
     rule: GroundTruthRule,
-    /// What the neighbours have sent, oldest first; the first is what has arrived last, or has not arrived yet.
+    /// Messages of the neighbours, oldest first; the first is the last that has arrived, or has not arrived yet.
     under_way: VecDeque<SentAtOnce>,
     maps: Option<MapSource>,
-    /// How messages cross the air; absent: at once, or after a fixed delay.
+    /// Link emulation in simulation time; absent: immediate delivery, or a fixed delay.
     stepped: Option<SteppedConfig>,
-    /// Who computes what the vehicles see; absent: this process.
+    /// Processes that run the vehicles' pipelines; absent: this process.
     remote: Option<RemotePool>,
     ledger: Ledger,
     /// Data that could not be used.
     left_out: LeftOut,
-    /// Bytes of all that neighbours handed to the air.
+    /// Bytes of all messages that neighbours handed to the link.
     sent_bytes: u64,
 }
 
@@ -141,34 +141,34 @@ impl Evaluator {
         })
     }
 
-    /// The same with messages that cross the emulated air, in virtual time.
+    /// The same with messages that pass through the link emulation, in simulation time.
     #[must_use]
     pub fn with_link(self, stepped: SteppedConfig) -> Self {
         Self { stepped: Some(stepped), ..self }
     }
 
-    /// Lets vehicles compute in processes of their own from now on, or in this one, where messages cross the emulated air.
-    /// Those of before get no more sweeps.
+    /// Runs the vehicles' pipelines in processes of their own from now on, or in this one, where the link is emulated.
+    /// The previous processes get no more sweeps.
     pub fn set_processes(&mut self, remote: Option<RemotePool>) {
         if let Some(before) = std::mem::replace(&mut self.remote, remote) {
             before.finish();
         }
     }
 
-    /// The books of all messages that crossed the air so far; empty without one.
+    /// The accounting of all messages on the link so far; empty without a link.
     #[must_use]
     pub fn ledger(&self) -> &Ledger {
         &self.ledger
     }
 
-    /// Bytes of all that neighbours handed to the air so far, poses and headers included; 0 without one.
+    /// Bytes of all messages that neighbours handed to the link so far, poses and headers included; 0 without a link.
     #[must_use]
     pub fn sent_bytes(&self) -> u64 {
         self.sent_bytes
     }
 
-    /// The same with maps that its encoder made before, kept as exactly as messages say them or more: those say the same
-    /// then.
+    /// The same with maps that its encoder computed before, stored at least as exactly as in messages: the messages are
+    /// then the same.
     #[must_use]
     pub fn with_maps(self, maps: MapSource) -> Self {
         Self { maps: Some(maps), ..self }
@@ -180,24 +180,24 @@ impl Evaluator {
         &self.ego
     }
 
-    /// The protocol with the ground-truth rule as it is applied to this network; absent where none was asked for.
+    /// The protocol with the ground-truth rule that applies to this network; absent where none was configured.
     #[must_use]
     pub fn protocol(&self) -> Option<EvaluationProtocol> {
         let protocol = self.config.protocol.clone()?;
         Some(EvaluationProtocol { ground_truth: self.rule, ..protocol })
     }
 
-    /// Which objects count.
+    /// Rule for the objects that count.
     #[must_use]
     pub fn rule(&self) -> &GroundTruthRule {
         &self.rule
     }
 
-    /// RunScope over a scenario, its first agent being the ego; `on_frame` may end it. Frames that cannot be read are left out
-    /// and counted ([`Self::left_out`]): a neighbour's as if it were absent, the ego's with its whole tick.
+    /// Runs over a scenario, its first agent being the ego; `on_frame` may end it. Frames that cannot be read are left
+    /// out and counted ([`Self::left_out`]): a neighbour's as if it were absent, the ego's with its whole tick.
     ///
     /// # Errors
-    /// [`EvaluateError`] when the pipeline refuses.
+    /// [`EvaluateError`] when the pipeline reports an error.
     pub fn run(
         &mut self,
         scenario: &Scenario,
@@ -241,7 +241,7 @@ impl Evaluator {
             None if is_ego => source_of_ego(all),
             None => all.clone(),
         };
-        // What the ego's own vehicle tells it does not cross the air.
+        // Messages of the ego's own vehicle are not transmitted on the link.
         let rate = if is_ego { RateConfig::default() } else { own.map_or(self.config.rate, |own| own.rate) };
         let detector = Detector::from_weights(&self.weights, &self.weights.config()?)?;
         let place = scenario.agents.iter().position(|agent| agent == cav).unwrap_or(0);
@@ -253,7 +253,7 @@ impl Evaluator {
         Ok(Participant::new(agent.within(rate), attack))
     }
 
-    /// Whether sweeps have to be read at all.
+    /// True if sweeps have to be read at all.
     fn needs_points(&self) -> bool {
         let shares_points = self.ego.method().own_content() == Exchange::Points;
         self.maps.is_none() || shares_points || self.config.pose_source.looks_at_sweeps()
@@ -269,11 +269,11 @@ impl Evaluator {
         let mut sent = Vec::with_capacity(sweeps.len());
         let mut frames = Vec::with_capacity(sweeps.len());
         for Sweep { place, frame, map } in sweeps {
-            // Without an exchange, neighbours have nothing to encode; where they are is still asked.
+            // Without an exchange, neighbours have nothing to encode; their poses are still needed.
             let is_needed = place == 0 || self.ego.method().exchange() != Exchange::Nothing;
             let codec = if place == 0 { of_the_ego(self.config.codec) } else { self.config.codec };
             let participant = &mut participants[place];
-            participant.overhear(sent.last());
+            participant.capture(sent.last());
             sent.push(view(participant, &frame, map.as_ref(), is_needed.then_some(exchange), &codec)?);
             frames.push(frame);
         }
@@ -282,7 +282,7 @@ impl Evaluator {
         let own = own.view().expect("the ego is needed by every method");
         self.under_way.push_back(SentAtOnce { capture_nanos: own.capture_nanos, sent });
         let (neighbours, bytes): (Vec<View>, Vec<_>) =
-            self.arrived(own.capture_nanos).iter().filter_map(Sent::heard).unzip();
+            self.arrived(own.capture_nanos).iter().filter_map(Sent::received).unzip();
         let output = self.ego.detect(&own, &neighbours)?;
         let result = self.report(tick, &own, &neighbours, &bytes, output);
         let objects = ground_truth::merge(&frames.iter().collect::<Vec<_>>(), 0, &self.rule);
@@ -291,8 +291,8 @@ impl Evaluator {
         Ok(EvaluatedFrame { tick, stamp, result, frames, poses, objects })
     }
 
-    /// What the ego would publish as its agent's frame of that number; `bytes` are payload and wire bytes of each
-    /// neighbour's message.
+    /// The result that the ego would publish as its agent's frame of that number; `bytes` are payload and wire bytes of
+    /// each neighbour's message.
     fn report(
         &self,
         agent_frame: usize,
@@ -330,7 +330,7 @@ impl Evaluator {
         }
     }
 
-    /// What the neighbours sent last of all that has arrived; nothing where all is still under way.
+    /// The newest messages of the neighbours that have arrived; empty where all are still in flight.
     fn arrived(&mut self, now_nanos: u64) -> &[Sent] {
         let delay_nanos = self.config.delay_nanos;
         let has_arrived = |tick: &SentAtOnce| tick.capture_nanos.saturating_add(delay_nanos) <= now_nanos;
@@ -341,7 +341,7 @@ impl Evaluator {
     }
 }
 
-/// The vehicles that lie wholly over the area of a detector, as annotated by all agents within 70 m.
+/// The vehicles that lie completely over the area of a detector, as annotated by all agents within 70 m.
 #[must_use]
 pub fn rule_for(config: &DetectorConfig) -> GroundTruthRule {
     let [x_low, y_low, z_low, x_high, y_high, z_high] = config.lidar_range_m;
@@ -355,13 +355,13 @@ pub fn rule_for(config: &DetectorConfig) -> GroundTruthRule {
     }
 }
 
-/// What the ego leaves out for others it has itself.
+/// The codec of the ego's own map, which is not restricted by a gate or a budget.
 fn of_the_ego(codec: CodecConfig) -> CodecConfig {
     CodecConfig { gate: None, budget_bytes: None, ..codec }
 }
 
-/// Where the ego's own poses come from: one fixed offset spares it, as in the reference code. With the same offset on all
-/// vehicles they would hardly be displaced among each other.
+/// Source of the ego's own poses: one fixed offset does not apply to it, as in the reference code. With the same offset
+/// on all vehicles the relative poses would hardly change.
 fn source_of_ego(all: &PoseSourceConfig) -> PoseSourceConfig {
     match all {
         PoseSourceConfig::Noisy(noisy) if noisy.mode == NoiseMode::Fixed => PoseSourceConfig::Recorded,

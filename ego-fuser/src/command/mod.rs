@@ -16,13 +16,13 @@ const OFFLINE: &str = "ego-fuser-offline";
 /// Subcommands of `ego-fuser`.
 #[derive(Debug, clap::Subcommand)]
 pub(crate) enum Command {
-    /// Compare ways to align two vehicles without GNSS
+    /// Compare alignment methods of two vehicles without GNSS
     Align(Forwarded),
     /// List the collaboration methods and what each sends
     Methods(methods::Arguments),
     /// Measure AP on recorded scenes
     Eval(Forwarded),
-    /// Measure what a method's own alignment leaves of offsets that are put on true poses
+    /// Measure the part of pose offsets that a method's own alignment leaves
     Residual(Forwarded),
     /// Run the fusing vehicle of a live fleet
     Run(Box<run::Arguments>),
@@ -37,7 +37,7 @@ impl Command {
         match self {
             Self::Methods(arguments) => arguments.run()?,
             Self::Run(arguments) => {
-                malloc_settings::ensure(&malloc_settings::KEPT_MEMORY).context("this program again")?;
+                malloc_settings::ensure(&malloc_settings::KEPT_MEMORY).context("restarting with malloc settings")?;
                 arguments.run()?;
             }
             Self::Align(forwarded) => offline(forwarded, "align")?,

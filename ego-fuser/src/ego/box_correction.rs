@@ -1,7 +1,7 @@
-//! Poses of neighbours corrected by the boxes that are in their maps.
+//! Pose correction by the boxes that neighbours' maps show.
 //!
-//! What a vehicle detects alone is its map under the head, and the ego has both: it finds in a neighbour's map what the
-//! neighbour itself would have sent as boxes, without another message to wait for.
+//! The head applied to a single vehicle's map gives that vehicle's ego-only boxes. The ego has both, map and head: it
+//! detects in a neighbour's map the boxes that the neighbour would have sent, without waiting for another message.
 
 use nalgebra::Isometry3;
 use perception::boxes::postprocess::{AgentBoxes, PostprocessConfig, postprocess};
@@ -12,11 +12,11 @@ use tch::Tensor;
 use fusion::MapMetadata;
 use fusion::pose_graph::{Observer, PoseGraphConfig, correct};
 
-/// Boxes at or below this score are no landmarks: the reference's threshold for boxes that poses are corrected by. It has
-/// nothing to do with which boxes are judged.
+/// Boxes at or below this score are no landmarks: the reference's threshold for boxes that correct poses. It is
+/// independent of the boxes that are scored.
 const LANDMARK_SCORE: f32 = 0.2;
 
-/// Corrects the poses in `metadata` by what each map `[1, C, H, W]` shows; the ego's stays.
+/// Corrects the poses in `metadata` by the boxes in each map `[1, C, H, W]`; the ego's pose is fixed.
 pub(super) fn correct_by_boxes(
     metadata: &mut [MapMetadata],
     maps: &[Tensor],
@@ -36,7 +36,7 @@ pub(super) fn correct_by_boxes(
     Ok(())
 }
 
-/// What a vehicle detects alone, in its own frame.
+/// Ego-only detections of a vehicle, in its own frame.
 fn boxes_in(map: &Tensor, detector: &Detector) -> Result<Vec<Detection>, DetectorError> {
     let limits =
         PostprocessConfig { score_threshold: LANDMARK_SCORE, ..PostprocessConfig::for_late_fusion(detector.config()) };

@@ -1,4 +1,4 @@
-//! Why the ego has no result.
+//! Errors of the ego's pipeline.
 
 use perception::detector::DetectorError;
 use perception::weights::WeightsError;
@@ -9,13 +9,13 @@ use fusion::method::{Exchange, Method, UnknownMethod};
 use fusion::model::StageError;
 use fusion::warp::WarpError;
 
-/// Why the ego has no result at all. What is wrong with a neighbour never leads here.
+/// Reason why the ego has no result at all. A faulty message of a neighbour never leads here.
 #[derive(Debug, thiserror::Error)]
 pub enum EgoError {
     /// The weights are not readable.
     #[error(transparent)]
     Weights(#[from] WeightsError),
-    /// The detector refused.
+    /// The detector reported an error.
     #[error(transparent)]
     Detector(#[from] DetectorError),
     /// The weights name a method that is not known.
@@ -27,14 +27,14 @@ pub enum EgoError {
     /// Own maps cannot be aligned.
     #[error(transparent)]
     Warp(#[from] WarpError),
-    /// The ego's own view is not what the method takes.
+    /// The ego's own view does not have the content that the method needs.
     #[error("method {method} needs the ego's own {needed:?}, not {found:?}")]
     OwnContent {
         /// The method.
         method: Method,
-        /// What it needs.
+        /// Content that it needs.
         needed: Exchange,
-        /// What came.
+        /// Content found.
         found: Exchange,
     },
     /// The ego's own map is of another network.
@@ -42,14 +42,14 @@ pub enum EgoError {
     OwnMap {
         /// Channels found.
         channels: u32,
-        /// Lattice found.
+        /// BEV grid found.
         found: BevGrid,
         /// Channels of the network.
         expected_channels: i64,
-        /// Lattice of the network.
+        /// BEV grid of the network.
         expected: BevGrid,
     },
-    /// The tensor library refused.
+    /// The tensor library reported an error.
     #[error("fusion: {0}")]
     Torch(#[from] TchError),
 }

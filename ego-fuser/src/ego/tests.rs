@@ -9,12 +9,12 @@ use tch::nn::VarStore;
 use super::*;
 use training::average_precision::{Ordering, Scorer};
 
-/// Capture time of all sweeps but those that say otherwise.
+/// Capture time of all sweeps unless stated otherwise.
 const NOW: u64 = 5_000_000_000;
 
 const HERE: Pose = Pose { translation_m: [100.0, 50.0, 2.0], rotation_wxyz: [1.0, 0.0, 0.0, 0.0] };
 
-/// The same network every time, with a head that believes in vehicles, so that there is something to clean up.
+/// The same network every time, with a head that detects vehicles everywhere, so that there is something to suppress.
 fn detector() -> Detector {
     detector_with(None)
 }
@@ -32,14 +32,14 @@ fn detector_of(compress_ratio: Option<i64>, logit: f64, weight: f64) -> Detector
     let network = VarStore::new(Device::Cpu);
     let pillars = PointPillars::new(&network.root(), &config).unwrap();
     for (name, mut variable) in network.variables() {
-        // No generator that tests running beside this one could disturb: values from the shape alone.
+        // Values from the shape only: tests that run at the same time share torch's generator.
         let count = variable.numel() as i64;
         let wave = (Tensor::arange(count, (Kind::Float, Device::Cpu)) * 0.7).sin().view(variable.size().as_slice());
         let new = match name.as_str() {
             name if name.contains("running") || name.ends_with("norm.weight") => continue,
             "cls_head.bias" => wave * 0.1 + logit,
             "cls_head.weight" => wave * weight,
-            // Boxes are the anchors themselves, which the clean-up takes for vehicles.
+            // Boxes are the anchors themselves, which post-processing accepts as vehicles.
             "reg_head.weight" | "reg_head.bias" => wave * 0.0,
             _ if variable.dim() > 1 => wave * (2.0 / (count as f64 / variable.size()[0] as f64).sqrt()),
             _ => continue,
@@ -82,25 +82,25 @@ fn a_neighbour_changes_what_is_seen_and_the_same_views_give_the_same_bits() {
     for method in [Method::EARLY, Method::MAX, Method::ATTENTION, Method::WHERE2COMM, Method::COALIGN] {
         let (own, other) = (view("a", HERE, method, 0.0), view("b", near(), method, 0.15));
         let mut ego = Ego::new(detector(), method).unwrap();
-        let alone = ego.detect(&own, &[]).unwrap();
+        let ego_only = ego.detect(&own, &[]).unwrap();
         let together = ego.detect(&own, std::slice::from_ref(&other)).unwrap();
         assert_eq!(together.fused, [0], "{method}");
         assert!(!together.detections.is_empty(), "{method}");
-        assert!(alone.detections != together.detections, "{method}: the neighbour changed nothing");
+        assert!(ego_only.detections != together.detections, "{method}: the neighbour changed nothing");
         let again = Ego::new(detector(), method).unwrap().detect(&own, std::slice::from_ref(&other)).unwrap();
         assert_eq!(again.detections, together.detections, "{method}");
     }
 }
 
 #[test]
-fn alone_the_points_show_what_the_map_shows_with_a_compressor_too() {
-    let alone = |compress_ratio, method| {
+fn ego_only_points_give_the_result_of_the_map_with_a_compressor_too() {
+    let ego_only = |compress_ratio, method| {
         let own = view_by(detector_with(compress_ratio), "a", HERE, method, 0.0);
         Ego::new(detector_with(compress_ratio), method).unwrap().detect(&own, &[]).unwrap().detections
     };
-    let by_map = alone(Some(4), Method::NONE);
-    assert!(!by_map.is_empty() && by_map != alone(None, Method::NONE));
-    assert_eq!(alone(Some(4), Method::EARLY), by_map);
+    let by_map = ego_only(Some(4), Method::NONE);
+    assert!(!by_map.is_empty() && by_map != ego_only(None, Method::NONE));
+    assert_eq!(ego_only(Some(4), Method::EARLY), by_map);
 }
 
 #[test]
@@ -116,7 +116,7 @@ fn late_fusion_moves_boxes_and_keeps_the_better_of_two() {
         capture_nanos: NOW,
         content: Content::Boxes(found),
     };
-    // The other stands 4 m ahead: its box at 1 m is the ego's at 5 m, the one at -10 m only it has seen.
+    // The other is 4 m ahead: its box at 1 m is the ego's at 5 m, only it has detected the one at -10 m.
     let own = boxes("a", HERE, vec![found(5.2, 0.6)]);
     let ahead = Pose { translation_m: [104.0, 50.0, 2.0], ..HERE };
     let other = boxes("b", ahead, vec![found(1.0, 0.9), found(-10.0, 0.5), found(-6.0, 0.05)]);
@@ -128,21 +128,22 @@ fn late_fusion_moves_boxes_and_keeps_the_better_of_two() {
 }
 
 #[test]
-fn with_none_left_the_maps_of_every_method_are_those_of_the_ego_alone() {
+fn with_none_left_the_maps_of_every_method_are_ego_only() {
     let own = view("a", HERE, Method::NONE, 0.0);
-    let alone = Ego::new(detector(), Method::NONE).unwrap().detect(&own, &[]).unwrap().detections;
-    assert!(!alone.is_empty());
+    let ego_only = Ego::new(detector(), Method::NONE).unwrap().detect(&own, &[]).unwrap().detections;
+    assert!(!ego_only.is_empty());
     let far = view("b", Pose::from_xyz_yaw([200.0, 50.0, 2.0], 0.0), Method::MAX, 0.0);
     let lost = View { pose: PoseEstimate::NoPose { reason: NoPoseReason::NoSource, inlier_count: 0 }, ..far.clone() };
     for method in [Method::MAX, Method::ATTENTION, Method::WHERE2COMM, Method::COALIGN, Method::DISCONET] {
         let output = Ego::new(detector(), method).unwrap().detect(&own, &[far.clone(), lost.clone()]).unwrap();
-        assert_eq!(output.detections, alone, "{method}");
+        assert_eq!(output.detections, ego_only, "{method}");
         let reasons = [(0, Skipped::Unusable(DropReason::OutOfRange)), (1, Skipped::Unusable(DropReason::NoPose))];
         assert_eq!((output.fused, output.skipped), (vec![], reasons.to_vec()), "{method}");
     }
 }
 
-/// Methods whose fusion leaves the map of an ego without neighbours as it is, trained or not; others make a map of their own.
+/// Methods whose fusion leaves the map of an ego without neighbours unchanged, trained or not; others compute a new
+/// map.
 fn leaves_one_map_as_it_is(method: Method) -> bool {
     ["none", "late", "early", "max", "attention", "where2comm", "coalign", "disconet"].contains(&method.name())
 }
@@ -155,19 +156,19 @@ fn average_precisions(detections: &[Detection], objects: &[protocol::Box3d]) -> 
 }
 
 #[test]
-fn alone_every_method_is_judged_as_none_down_to_the_same_score() {
-    // Most scores lie between 0.1 and 0.2: judged from there on, hardly anything would be left.
+fn ego_only_every_method_is_scored_as_none_down_to_the_same_score() {
+    // Most scores lie between 0.1 and 0.2: with a threshold above, hardly any box would be scored.
     let unsure = || detector_of(None, -1.8, 1e-4);
-    let alone = |method| {
+    let ego_only = |method| {
         let own = view_by(unsure(), "a", HERE, method, 0.0);
         Ego::new(unsure(), method).unwrap().detect(&own, &[]).unwrap().detections
     };
-    let expected = alone(Method::NONE);
+    let expected = ego_only(Method::NONE);
     let scores: Vec<f32> = expected.iter().map(|found| found.score).collect();
     assert!(scores.iter().any(|score| (0.1..0.2).contains(score)), "{scores:?}");
     let objects: Vec<_> = expected.iter().step_by(2).map(|found| found.box3d).collect();
     for method in Method::ALL.into_iter().filter(|method| leaves_one_map_as_it_is(*method)) {
-        let found = alone(method);
+        let found = ego_only(method);
         assert_eq!(found.len(), expected.len(), "{method}");
         for (found, expected) in found.iter().zip(&expected) {
             assert_eq!(found.score, expected.score, "{method}");
@@ -179,7 +180,7 @@ fn alone_every_method_is_judged_as_none_down_to_the_same_score() {
 }
 
 #[test]
-fn an_ego_without_pose_goes_on_alone() {
+fn an_ego_without_pose_continues_ego_only() {
     let own = view("a", HERE, Method::MAX, 0.0);
     let lost = View { pose: PoseEstimate::NoPose { reason: NoPoseReason::NoSource, inlier_count: 0 }, ..own.clone() };
     let mut ego = Ego::new(detector(), Method::MAX).unwrap();
@@ -201,7 +202,7 @@ fn cells_that_were_not_sent_have_no_part() {
 }
 
 #[test]
-fn what_is_not_worth_sending_is_not_on_the_air_and_the_rest_is_fused_as_it_is() {
+fn unselected_cells_are_not_sent_and_the_rest_is_fused_unchanged() {
     let own = view("a", HERE, Method::WHERE2COMM, 0.0);
     let mut other = view("b", near(), Method::WHERE2COMM, 0.1);
     let Content::Features(map) = &mut other.content else { panic!("maps are exchanged") };
@@ -256,7 +257,7 @@ fn codes_are_fused_as_the_maps_that_they_stand_for_and_no_others() {
     let mut ego = Ego::new(squeezed(4), Method::MAX).unwrap();
     let together = ego.detect(&own, std::slice::from_ref(&other)).unwrap();
     assert_eq!(together.fused, [0]);
-    // The same network with nothing to widen is told the maps behind the compressor.
+    // The same network without a compressor is given the decompressed maps.
     let widened = |view: &View| {
         let Content::Features(map) = &view.content else { panic!("max exchanges maps") };
         let features = detector().to_message(&squeezed(4).received(map).unwrap()).unwrap();
@@ -264,7 +265,7 @@ fn codes_are_fused_as_the_maps_that_they_stand_for_and_no_others() {
     };
     let mut plain = Ego::new(detector(), Method::MAX).unwrap();
     assert_eq!(plain.detect(&widened(&own), &[widened(&other)]).unwrap().detections, together.detections);
-    // As many channels, but of another map; and a map where a code is expected.
+    // As many channels, but of another map; and a map where a compressed code is expected.
     let mut of_another = other.clone();
     let Content::Features(map) = &mut of_another.content else { panic!("max exchanges maps") };
     map.features.code_of = Some(128);
@@ -285,7 +286,7 @@ fn maps_of_earlier_frames_are_moved_by_the_egos_motion_and_come_in_once() {
     let other = view("b", near(), Method::PASTAT, 0.15);
     let (first, second) = (at(0, 0.0), at(1, 2.0));
     ego.detect(&first, std::slice::from_ref(&other)).unwrap();
-    // The neighbour has nothing new to say: its message serves again, and is not its own history.
+    // The neighbour has no newer message: its message serves again, and is not its own history.
     let aligned = |own, other| {
         vec![Aligned { view: own, ego_from_cav: Pose::IDENTITY }, Aligned { view: other, ego_from_cav: Pose::IDENTITY }]
     };

@@ -1,63 +1,65 @@
-//! What speaks for a neighbour and what against it, in one frame.
+//! Evidence for and against a neighbour in one frame.
 //!
-//! The weights are logarithms of how often honest neighbours and liars of each sort say such a thing on the validation
-//! scenes (seed 910: 591 messages of honest ones, as many of each sort of lie, maps and boxes of `max`), rounded. Lies are
-//! of several sorts, and what speaks against one says nothing of another, so the strongest doubt counts.
+//! The weights are logarithms of the relative frequencies of such messages among honest neighbours and each type of
+//! attacker on the validation scenes (seed 910: 591 messages of honest neighbours, as many of each type of attack, maps
+//! and boxes of `max`), rounded. Attacks differ, and evidence against one is no evidence against another, so the
+//! strongest evidence counts.
 
 use nalgebra::{Isometry2, Point2};
 use protocol::MisbehaviourReason;
 
 use super::seen::Observation;
 
-/// Two boxes this near are the same vehicle, metres; with age the radius grows.
+/// Two boxes this near are the same vehicle, metres; the radius grows with age.
 const SAME_M: f64 = 2.0;
-/// How fast vehicles may drive while a message is under way, metres a second.
+/// Assumed speed of vehicles while a message is in flight, metres per second.
 const DRIVES_MPS: f64 = 12.0;
 /// A box this near to a sensor is the vehicle that carries it, metres.
 const OWN_BODY_M: f64 = 2.5;
-/// Both vehicles see what is within so far of both, unless something stands between, metres.
+/// Both vehicles detect objects within this distance of both, unless they are occluded, metres.
 const NEAR_M: f64 = 35.0;
-/// Less sure of a vehicle than this, an ego that looks at a place sees that there is none.
+/// A confidence of a vehicle below this means that the ego observes an empty place.
 const EMPTY: f32 = 0.06;
-/// Messages more alike than this are the same one. Of two vehicles they never are: 0.92 at most.
+/// Messages with a higher similarity are the same one. Two vehicles reach 0.92 at most.
 const COPY: f64 = 0.98;
-/// Maps of one vehicle 0.1 s apart are more alike than this: 0.92 nearly always. Noise is not.
+/// Maps of one vehicle 0.1 s apart have a higher similarity than this: 0.92 nearly always. Noise does not.
 const SUCCESSIVE: f64 = 0.85;
-/// Points without a single vehicle, where the ego sees some: those of an honest neighbour hardly ever, those of noise
-/// always. Of noise far away nothing else tells, as such maps are alike.
+/// Log odds of points without a single vehicle, where the ego detects some: rare for an honest neighbour, always so for
+/// noise. It is the only evidence against distant noise, as such maps are similar to each other.
 const BLIND: f64 = -1.5;
 
-/// What a neighbour's message and the ego's own have to say to each other.
+/// Comparison of a neighbour's message with the ego's own.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub(super) struct Evidence {
-    /// From one sensor to the other by their poses, metres.
+    /// Distance between the sensors by their poses, metres.
     pub(super) distance_m: f64,
-    /// Vehicles of theirs near both that the ego sees too.
+    /// Vehicles of the neighbour near both that the ego detects too.
     pub(super) matched: u32,
-    /// Vehicles of theirs near both where the ego sees none.
+    /// Vehicles of the neighbour near both where the ego detects none.
     pub(super) contradicted: u32,
-    /// Vehicles of theirs further away where the ego sees none.
+    /// Vehicles of the neighbour further away where the ego detects none.
     pub(super) strange: u32,
-    /// Vehicles of the ego's near both where they see none.
+    /// Vehicles of the ego near both where the neighbour detects none.
     pub(super) missed: u32,
-    /// How sure the ego is of a vehicle where the neighbour says to be, 0..1; nothing where it cannot look.
+    /// Confidence of the ego in a vehicle at the neighbour's reported position, 0..1; `None` where it cannot observe
+    /// it.
     pub(super) ego_sees_it: Option<f32>,
-    /// How sure the neighbour is of a vehicle where the ego is.
+    /// Confidence of the neighbour in a vehicle at the ego's position, 0..1.
     pub(super) it_sees_ego: Option<f32>,
-    /// How alike the message is to the most similar one of anybody else's, now or before.
+    /// Similarity of the message to the most similar one of any other sender, now or before.
     pub(super) like_another: f64,
-    /// How alike it is to the neighbour's own one just before.
+    /// Similarity to the neighbour's own previous message.
     pub(super) like_before: Option<f64>,
-    /// Whether it stands where it cannot have driven to.
+    /// True if its pose is not reachable from the previous one.
     pub(super) jumped: bool,
-    /// Whether it sees no vehicle in its points, and the ego does in its own.
+    /// True if its points contain no vehicle, and the ego's own do.
     pub(super) is_blind: bool,
-    /// Whether all this is from boxes, which do not tell an empty place from a doubtful one.
+    /// True if all this is derived from boxes, which do not distinguish empty places from uncertain ones.
     pub(super) boxes_only: bool,
 }
 
 impl Evidence {
-    /// Compares a neighbour's message with the ego's own; `age_s` is how much older it is.
+    /// Compares a neighbour's message with the ego's own; `age_s` is the difference of their ages, seconds.
     pub(super) fn between(own: &Observation, theirs: &Observation, ego_from_cav: &Isometry2<f64>, age_s: f64) -> Self {
         let radius_m = SAME_M + DRIVES_MPS * age_s.abs().min(1.0);
         let cav_from_ego = ego_from_cav.inverse();
@@ -90,21 +92,21 @@ impl Evidence {
         evidence
     }
 
-    /// The logarithm of how much more likely an honest neighbour says this than a liar of the sort it looks most like,
-    /// and which sort that is; nothing where there is nothing to compare.
+    /// Log likelihood ratio of an honest neighbour and the most likely type of attacker, and that type; `None` without
+    /// anything to compare.
     pub(super) fn judgement(&self) -> Option<(f64, MisbehaviourReason)> {
         let elsewhere = self.against_elsewhere().map(|odds| (odds, MisbehaviourReason::PositionMismatch));
         let invention = self.against_invention().map(|odds| (odds, MisbehaviourReason::GhostObjects));
-        let doubts = [elsewhere, invention, self.against_other_lies()];
-        doubts.into_iter().flatten().min_by(|(one, _), (other, _)| one.total_cmp(other))
+        let candidates = [elsewhere, invention, self.against_other_attacks()];
+        candidates.into_iter().flatten().min_by(|(one, _), (other, _)| one.total_cmp(other))
     }
 
-    /// The logarithm alone.
+    /// The log likelihood ratio without the type.
     pub(super) fn log_odds(&self) -> Option<f64> {
         self.judgement().map(|(log_odds, _)| log_odds)
     }
 
-    /// Against one that is not where it says to be, or sees nothing.
+    /// Evidence against a neighbour with a wrong position or without perception.
     fn against_elsewhere(&self) -> Option<f64> {
         let seen = [self.ego_sees_it, self.it_sees_ego].into_iter().flatten();
         let seen = seen.map(|sure| self.seeing(sure)).collect::<Vec<_>>();
@@ -115,20 +117,20 @@ impl Evidence {
             return None;
         }
         let matched = [0.0, 1.5, 2.2, 2.8][self.matched.min(3) as usize];
-        let alone = if self.matched == 0 { -0.5 * f64::from(self.contradicted.min(3)) } else { 0.0 };
+        let unmatched = if self.matched == 0 { -0.5 * f64::from(self.contradicted.min(3)) } else { 0.0 };
         let missed = -0.3 * f64::from(self.missed.saturating_sub(1).min(4));
-        Some(matched + seen.iter().sum::<f64>().clamp(-4.0, 2.0) + alone + missed)
+        Some(matched + seen.iter().sum::<f64>().clamp(-4.0, 2.0) + unmatched + missed)
     }
 
-    /// Against one that is where it says to be and sees more than there is.
+    /// Evidence against a neighbour at its reported position with ghost objects.
     fn against_invention(&self) -> Option<f64> {
         let odds: &[f64] = match self.boxes_only {
             false => &[0.0, -0.6, -3.6, -5.0],
-            // The nearer the two are, the more there is that only one of them can see.
+            // The nearer the two are, the more the areas that only one of them observes.
             true if self.distance_m < 30.0 => &[0.0, 0.0, -0.5, -3.0, -5.0],
             true => &[0.0, -1.0, -4.0],
         };
-        // What is further away an honest one may well see alone, but hardly much of it.
+        // Further away an honest neighbour may detect some objects that the ego does not, but few.
         let enough = match (self.boxes_only, self.contradicted > 0) {
             (false, false) => 6,
             (false, true) | (true, false) => 3,
@@ -139,8 +141,8 @@ impl Evidence {
         (odds < 0.0).then_some(odds)
     }
 
-    /// Against a copier, one whose maps have nothing to do with each other, one that jumps.
-    fn against_other_lies(&self) -> Option<(f64, MisbehaviourReason)> {
+    /// Evidence against a copier, against unrelated successive maps and against jumps.
+    fn against_other_attacks(&self) -> Option<(f64, MisbehaviourReason)> {
         let is_torn = !self.boxes_only && self.like_before.is_some_and(|like| like < SUCCESSIVE);
         let is_copied = self.like_another > COPY;
         let sure = [
@@ -148,12 +150,12 @@ impl Evidence {
             (self.jumped, -4.0, MisbehaviourReason::ImplausibleMotion),
             (is_torn, -3.0, MisbehaviourReason::Inconsistent),
         ];
-        sure.into_iter().find_map(|(is_so, odds, doubt)| is_so.then_some((odds, doubt)))
+        sure.into_iter().find_map(|(is_so, odds, reason)| is_so.then_some((odds, reason)))
     }
 
-    /// Whether one of the two sees the other where it says to be: within 35 m an honest one is always seen with more than
-    /// 0.06 and hardly ever with less than 0.15, of liars four of five are not. Further away something may well stand
-    /// between. Boxes that are evidence begin at 0.2.
+    /// Evidence from one vehicle's confidence in the other at its reported position: within 35 m an honest neighbour is
+    /// always detected with more than 0.06 and hardly ever with less than 0.15; four of five attackers are not. Further
+    /// away occlusion is common. Boxes that are evidence begin at 0.2.
     fn seeing(&self, sure: f32) -> f64 {
         let blind = sure < if self.boxes_only { 0.01 } else { EMPTY };
         match (sure, self.distance_m) {
@@ -186,7 +188,7 @@ mod tests {
     use super::*;
     use crate::view::Content;
 
-    /// Boxes as a vehicle at a place sees those of a world.
+    /// Boxes that a vehicle at a position detects of the vehicles in a world.
     fn boxes(world: &[[f64; 2]], from: [f64; 2]) -> Content {
         let seen = world.iter().map(|[x, y]| Detection {
             box3d: Box3d { center_m: [x - from[0], y - from[1], -1.0], size_m: [4.4, 1.9, 1.6], heading_rad: 0.0 },
@@ -205,7 +207,7 @@ mod tests {
     const WORLD: [[f64; 2]; 6] = [[0.0, 0.0], [20.0, 3.0], [10.0, -6.0], [-8.0, 4.0], [25.0, -9.0], [14.0, 12.0]];
 
     #[test]
-    fn an_honest_neighbour_is_believed_and_one_that_stands_elsewhere_is_not() {
+    fn an_honest_neighbour_is_accepted_and_a_wrong_position_is_not() {
         let (own, theirs) = (seen(&boxes(&WORLD, WORLD[0])), seen(&boxes(&WORLD, WORLD[1])));
         let honest = Evidence::between(&own, &theirs, &Isometry2::translation(20.0, 3.0), 0.0);
         assert_eq!((honest.matched, honest.contradicted, honest.missed), (4, 0, 0));
@@ -222,27 +224,27 @@ mod tests {
         let theirs = seen(&boxes(&more, WORLD[1]));
         let evidence = Evidence::between(&own, &theirs, &Isometry2::translation(20.0, 3.0), 0.0);
         assert_eq!((evidence.matched, evidence.contradicted), (4, 5));
-        let (log_odds, doubt) = evidence.judgement().unwrap();
-        assert!(log_odds < -3.0 && doubt == MisbehaviourReason::GhostObjects);
+        let (log_odds, reason) = evidence.judgement().unwrap();
+        assert!(log_odds < -3.0 && reason == MisbehaviourReason::GhostObjects);
     }
 
     #[test]
-    fn a_copy_a_jump_and_noise_are_told() {
+    fn a_copy_a_jump_and_noise_are_detected() {
         let fine = Evidence { matched: 3, ego_sees_it: Some(0.6), it_sees_ego: Some(0.6), ..Evidence::default() };
         assert!(fine.log_odds().unwrap() > 4.0);
         let copied = Evidence { like_another: 1.0, ..fine.clone() };
         let jumped = Evidence { jumped: true, ..Evidence::default() };
         let torn = Evidence { like_before: Some(0.7), ..Evidence::default() };
-        for (evidence, doubt) in [
+        for (evidence, reason) in [
             (copied, MisbehaviourReason::Duplicated),
             (jumped, MisbehaviourReason::ImplausibleMotion),
             (torn, MisbehaviourReason::Inconsistent),
         ] {
             let (log_odds, found) = evidence.judgement().unwrap();
-            assert!(log_odds < -2.0 && found == doubt, "{found}");
+            assert!(log_odds < -2.0 && found == reason, "{found}");
         }
         let blind = Evidence { is_blind: true, ego_sees_it: Some(0.6), ..Evidence::default() };
         assert_eq!(blind.judgement(), Some((BLIND, MisbehaviourReason::PositionMismatch)));
-        assert_eq!(Evidence::default().log_odds(), None, "nothing said, nothing known");
+        assert_eq!(Evidence::default().log_odds(), None, "no content, no evidence");
     }
 }

@@ -1,4 +1,4 @@
-//! What one vehicle's message shows, looked at alone and in its own frame.
+//! Observation: content of one vehicle's message, evaluated separately and in its own frame.
 
 use nalgebra::Isometry3;
 use perception::boxes::postprocess::{AgentBoxes, PostprocessConfig, postprocess};
@@ -9,26 +9,26 @@ use tch::Tensor;
 
 use crate::view::Content;
 
-/// Boxes below this score say nothing about who sent them.
+/// Boxes below this score are no evidence about their sender.
 const SURE: f32 = 0.3;
-/// Boxes at or below this score are no evidence for or against who sent them. It has nothing to do with which boxes are
-/// judged.
+/// Boxes at or below this score are no evidence for or against their sender. It is independent of the boxes that are
+/// scored.
 const EVIDENT: f32 = 0.2;
-/// Values of a map that are compared to tell copies, spread over it.
-const PRINT_VALUES: usize = 4096;
-/// How far a detector looks, where there is no map to say so, metres.
+/// Values of a map that are compared to detect copies, spread over it.
+const FINGERPRINT_VALUES: usize = 4096;
+/// Range of a detector when there is no map that gives it, metres.
 const REACH_M: f64 = 35.0;
 
-/// What a message shows.
+/// Content of a message.
 #[derive(Debug)]
 pub(super) struct Observation {
-    /// Where there are vehicles, sure ones only, metres.
+    /// Positions of confidently detected vehicles, metres.
     pub(super) vehicles: Vec<[f64; 2]>,
-    /// How sure the head is of a vehicle at each cell; or all boxes and their scores, where there are boxes only.
+    /// Confidence of the head in a vehicle at each cell; or all boxes and their scores, where there are boxes only.
     sure: Sure,
-    /// Enough of it to tell a copy.
-    pub(super) print: Vec<f32>,
-    /// Whether these are points in which there is not one vehicle.
+    /// Fingerprint: enough values to detect a copy.
+    pub(super) fingerprint: Vec<f32>,
+    /// True for points that contain no vehicle.
     pub(super) is_blind: bool,
 }
 
@@ -39,7 +39,7 @@ enum Sure {
 }
 
 impl Observation {
-    /// Looks at a message; `empty` is the map of an empty world, `[C, H, W]`. Points are encoded for it.
+    /// Evaluates a message; `empty` is the map of an empty world, `[C, H, W]`. Points are encoded for it.
     pub(super) fn in_message(content: &Content, detector: &mut Detector, empty: &[f32]) -> Result<Self, DetectorError> {
         match content {
             Content::Features(map) => Self::in_map(&detector.received(map)?, map.sent.as_deref(), detector, empty),
@@ -58,15 +58,15 @@ impl Observation {
 
     pub(super) fn of_boxes(all: Vec<([f64; 2], f32)>) -> Self {
         let vehicles: Vec<_> = all.iter().filter(|(_, score)| *score >= SURE).map(|(at_m, _)| *at_m).collect();
-        let print = all.iter().flat_map(|([x, y], score)| [*x as f32, *y as f32, *score]).collect();
-        Self { vehicles, sure: Sure::Boxes(all), print, is_blind: false }
+        let fingerprint = all.iter().flat_map(|([x, y], score)| [*x as f32, *y as f32, *score]).collect();
+        Self { vehicles, sure: Sure::Boxes(all), fingerprint, is_blind: false }
     }
 
-    /// In a map `[1, C, H, W]`, of which the `sent` cells came; all where absent.
+    /// From a map `[1, C, H, W]`, of which the `sent` cells were received; all where absent.
     fn in_map(map: &Tensor, sent: Option<&[bool]>, detector: &Detector, empty: &[f32]) -> Result<Self, DetectorError> {
         let grid = detector.grid();
         let heads = detector.heads(map)?;
-        // What was left out has no features that a head could make sense of.
+        // Cells that were not sent have no features that a head can interpret.
         let was_sent = |cell: usize| sent.is_none_or(|sent| sent[cell]);
         let limits =
             PostprocessConfig { score_threshold: SURE, ..PostprocessConfig::for_late_fusion(detector.config()) };
@@ -78,24 +78,24 @@ impl Observation {
         });
         let found: Vec<_> = found.collect();
         let values: Vec<f32> = Vec::try_from(&map.f_contiguous()?.f_view([-1])?)?;
-        let print = values.iter().zip(empty).step_by((empty.len() / PRINT_VALUES).max(1));
-        let print = print.map(|(value, nothing)| value - nothing).collect();
+        let fingerprint = values.iter().zip(empty).step_by((empty.len() / FINGERPRINT_VALUES).max(1));
+        let fingerprint = fingerprint.map(|(value, nothing)| value - nothing).collect();
         if detector.config().y_axis == YAxis::Right {
-            // The cells of a mirrored world lie elsewhere; its boxes do not.
-            return Ok(Self { print, ..Self::of_boxes(found) });
+            // The cells of a mirrored network lie elsewhere; its boxes do not.
+            return Ok(Self { fingerprint, ..Self::of_boxes(found) });
         }
         let mut cells = heads.confidence;
         cells.iter_mut().enumerate().filter(|(cell, _)| !was_sent(*cell)).for_each(|(_, sure)| *sure = 0.0);
         let vehicles = found.into_iter().map(|(at_m, _)| at_m).collect();
-        Ok(Self { vehicles, sure: Sure::Cells(grid, cells), print, is_blind: false })
+        Ok(Self { vehicles, sure: Sure::Cells(grid, cells), fingerprint, is_blind: false })
     }
 
-    /// Whether only boxes are known: then a place without one may be empty or merely doubtful.
+    /// True if only boxes are known: a place without one may then be empty or merely uncertain.
     pub(super) fn is_boxes(&self) -> bool {
         matches!(self.sure, Sure::Boxes(_))
     }
 
-    /// How sure the detector is of a vehicle within `radius_m` of a place, 0..1; nothing where it does not look.
+    /// Confidence of the detector in a vehicle within `radius_m` of a position, 0..1; `None` outside its range.
     pub(super) fn sure_at(&self, at_m: [f64; 2], radius_m: f64) -> Option<f32> {
         match &self.sure {
             Sure::Cells(grid, cells) => around(grid, at_m, radius_m).map(|cell| cells[cell]).reduce(f32::max),
@@ -108,7 +108,7 @@ impl Observation {
     }
 }
 
-/// The cell of a lattice that a point lies in.
+/// The cell of a grid that contains a point.
 fn cell_of(grid: &BevGrid, x_m: f64, y_m: f64) -> Option<usize> {
     let column = ((x_m - grid.x_min_m) / grid.cell_m).floor();
     let row = ((y_m - grid.y_min_m) / grid.cell_m).floor();
@@ -116,7 +116,7 @@ fn cell_of(grid: &BevGrid, x_m: f64, y_m: f64) -> Option<usize> {
     inside.then(|| row as usize * grid.width as usize + column as usize)
 }
 
-/// The cells of a lattice whose middles lie within a radius; none for a place outside.
+/// The cells of a grid whose centres lie within a radius; none for a position outside.
 fn around(grid: &BevGrid, [x, y]: [f64; 2], radius_m: f64) -> impl Iterator<Item = usize> + use<> {
     let grid = *grid;
     let reach = (radius_m / grid.cell_m).ceil() as i64;
@@ -128,7 +128,7 @@ fn around(grid: &BevGrid, [x, y]: [f64; 2], radius_m: f64) -> impl Iterator<Item
         .filter_map(move |(down, right)| cell_of(&grid, x + right, y + down))
 }
 
-/// How alike two messages are, -1..1; 1 for copies.
+/// Cosine similarity of two messages, -1..1; 1 for copies.
 pub(super) fn cosine_similarity(one: &[f32], other: &[f32]) -> f64 {
     if one.len() != other.len() || one.is_empty() {
         return 0.0;
@@ -155,7 +155,8 @@ mod tests {
         assert_eq!(around(&grid, [9.0, 0.0], 6.0).count(), 0);
         let mut sure = vec![0.0; 128];
         sure[cell_of(&grid, 1.2, 0.7).unwrap()] = 0.8;
-        let seen = Observation { vehicles: vec![], sure: Sure::Cells(grid, sure), print: vec![], is_blind: false };
+        let seen =
+            Observation { vehicles: vec![], sure: Sure::Cells(grid, sure), fingerprint: vec![], is_blind: false };
         assert_eq!(seen.sure_at([1.0, 0.5], 1.0), Some(0.8));
         assert_eq!(seen.sure_at([-2.0, 0.5], 1.0), Some(0.0));
         assert_eq!(seen.sure_at([20.0, 0.5], 1.0), None);
@@ -174,7 +175,7 @@ mod tests {
         let seen = Observation::in_message(&Content::Boxes(found.to_vec()), &mut detector, &[]).unwrap();
         assert_eq!(seen.vehicles, [[4.0, 0.0]]);
         assert_eq!((seen.sure_at([8.0, 0.0], 1.0), seen.sure_at([12.0, 0.0], 1.0)), (Some(0.25), Some(0.0)));
-        assert_eq!(seen.print.len(), 2 * 3);
+        assert_eq!(seen.fingerprint.len(), 2 * 3);
     }
 
     #[test]

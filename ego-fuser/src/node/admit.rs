@@ -1,4 +1,4 @@
-//! Messages on their way in: decoded, counted, laid where they wait.
+//! Incoming messages: decoded, counted and queued.
 
 use std::time::{Duration, Instant};
 
@@ -10,15 +10,15 @@ use super::{Node, OwnFrame, Received};
 use crate::ego::{Content, View};
 use crate::neighbourhood::sender_of;
 
-/// A neighbour's map may be of so much later a time than the newest of the ego's own, nanoseconds: its computer is faster.
+/// Largest lead of a neighbour's message over the newest of the ego's own, nanoseconds: its computer may be faster.
 const MAX_AHEAD_NANOS: u64 = 2_000_000_000;
 
 impl Node<'_> {
-    /// Takes a message in: the own agent's begins a frame, a neighbour's waits for one.
+    /// Admits a message: the own agent's begins a frame, a neighbour's is queued for one.
     pub(super) fn admit(&mut self, arrival: &Arrival) {
         let Some((cav, stream)) = sender_of(&arrival.topic) else { return };
         if stream == Stream::Descriptor {
-            return self.hear_of(cav, arrival);
+            return self.admit_descriptor(cav, arrival);
         }
         if *cav != self.cav && self.models.is_other(cav) {
             return self.bus.books().dropped(&arrival.topic, DropReason::Shape);
@@ -42,7 +42,7 @@ impl Node<'_> {
             return;
         }
         if let Some(neighbourhood) = &mut self.neighbourhood {
-            neighbourhood.spoke(cav);
+            neighbourhood.received(cav);
         }
         let payload_bytes = u64::from(arrival.header.metadata_len) + arrival.header.body_len;
         let wire_bytes = payload_bytes + HEADER_LEN as u64 + pose_message_bytes(&arrival.header.stamp, pose);
@@ -51,8 +51,8 @@ impl Node<'_> {
         }
     }
 
-    /// Whether a message tells of a time that has not come, later than the ego's own sweeps by more than its own agent may
-    /// lag behind; or of one that no frame of the ego asks for any more.
+    /// Reason to drop a message by its time: it is in the future, later than the ego's own sweeps by more than its own
+    /// agent may lag behind; or so old that no frame of the ego will use it.
     fn out_of_time(&self, arrival: &Arrival) -> Option<DropReason> {
         let capture_nanos = arrival.header.stamp.capture_nanos;
         let newest = self.own_nanos?;
@@ -66,11 +66,11 @@ impl Node<'_> {
         }
     }
 
-    /// The ego's own sweeps say what time it is. Where they begin anew, so does everything.
+    /// Sets the clock by the ego's own sweeps. Where the scene restarts, all state is reset.
     fn keep_time(&mut self, capture_nanos: u64) {
         let max_age_nanos = self.options.pairing.max_age_nanos;
         if self.own_nanos.is_some_and(|own| capture_nanos.saturating_add(max_age_nanos) < own) {
-            tracing::info!(capture_nanos, "the scene has begun anew");
+            tracing::info!(capture_nanos, "the scene has restarted");
             for cav in self.pairing.cavs() {
                 for _ in 0..self.pairing.turn_back(&cav, capture_nanos, MAX_AHEAD_NANOS) {
                     self.bus.books().dropped(&self.topic(&cav), DropReason::Stale);
@@ -81,10 +81,10 @@ impl Node<'_> {
         self.own_nanos = Some(capture_nanos);
     }
 
-    /// Takes in what an agent says of itself. The maps of another network are left out from then on.
-    fn hear_of(&mut self, cav: &CavId, arrival: &Arrival) {
+    /// Processes an agent's descriptor. Maps of another network are left out from then on.
+    fn admit_descriptor(&mut self, cav: &CavId, arrival: &Arrival) {
         let Some(descriptor) = self.inbox.decode::<Descriptor>(arrival, &self.options.limits) else { return };
-        let Some(other) = self.models.hear(cav, &descriptor) else { return };
+        let Some(other) = self.models.update(cav, &descriptor) else { return };
         if *cav == self.cav {
             tracing::error!(%cav, "the ego's own agent runs another network than the ego: {other}");
             return;
@@ -95,7 +95,7 @@ impl Node<'_> {
         }
     }
 
-    /// Pose and content of a message; an unsound one is counted under its sender and reason.
+    /// Pose and content of a message; an invalid one is counted under its sender and reason.
     fn decode(&self, arrival: &Arrival) -> Option<(PoseEstimate, Content)> {
         let limits = &self.options.limits;
         match self.stream {
@@ -123,7 +123,7 @@ impl Node<'_> {
     }
 }
 
-/// What the neighbour's `pose` message for the same frame took: it says the same as the pose inside this one.
+/// Wire size of the neighbour's `pose` message for the same frame, bytes: its content equals the pose inside this one.
 fn pose_message_bytes(stamp: &Stamp, pose: PoseEstimate) -> u64 {
     wire::encode(stamp, pose).map_or(0, |encoded| encoded.wire_bytes() as u64)
 }

@@ -1,4 +1,4 @@
-//! Frames on their way out: when to stop waiting, what to fuse, what to tell.
+//! Outgoing frames: end of the wait, selection of messages, fusion and report.
 
 use std::time::Duration;
 
@@ -8,32 +8,32 @@ use protocol::{Body, CavId, Detections, DropReason, Encoded, wire};
 
 use super::{Node, OwnFrame};
 use crate::ego::{EgoOutput, Skipped, View};
-use crate::misbehaviour::{Assessment, heard};
+use crate::misbehaviour::{self, Assessment};
 use crate::neighbourhood::Neighbourhood;
 use crate::pairing::Paired;
 
-/// The neighbours' messages for a frame, and who has none.
+/// The neighbours' messages for a frame, and the neighbours without one.
 #[derive(Default)]
 struct Choice {
     views: Vec<View>,
     /// One for each view.
-    books: Vec<Booking>,
+    messages: Vec<MessageInfo>,
     skipped: Vec<SkippedNeighbour>,
 }
 
-/// What the books and the report need to know of a message.
-struct Booking {
+/// Fields of a message for accounting and report.
+struct MessageInfo {
     is_first_use: bool,
     payload_bytes: u64,
     wire_bytes: u64,
 }
 
 impl Node<'_> {
-    /// Decides the frames that have nothing left to wait for; all of them where `must`.
+    /// Decides the frames that wait for nothing more; all of them where `must`.
     pub(super) fn decide(&mut self, must: bool) {
         while let Some(frame) = self.frames.front() {
             let is_complete = self.is_complete(frame.capture_nanos);
-            // A frame with a newer one behind it has waited too long already.
+            // A frame followed by a newer one has waited too long already.
             let is_due = frame.begun.elapsed() >= self.options.deadline || self.frames.len() > 1 || must;
             if !is_complete && !is_due {
                 return;
@@ -48,7 +48,7 @@ impl Node<'_> {
     fn is_complete(&self, capture_nanos: u64) -> bool {
         let tolerance = self.options.pairing.max_lead_nanos;
         self.neighbourhood.iter().flat_map(Neighbourhood::awaited).all(|cav| {
-            // Or a later one: then this frame's own is lost, and waiting is of no use.
+            // Or a later one: then this frame's own is lost, and waiting is useless.
             self.ended.contains(cav)
                 || self.models.is_other(cav)
                 || self.pairing.capture_times(cav).any(|time| time.saturating_add(tolerance) >= capture_nanos)
@@ -62,7 +62,7 @@ impl Node<'_> {
         let own_topic = self.topic(&self.cav);
         match self.ego.detect(&own, &choice.views) {
             Ok(EgoOutput { detections, fused, skipped, beliefs, stages }) => {
-                let heard = self.heard(&beliefs, &choice.views);
+                let heard = self.neighbour_reports(&beliefs, &choice.views);
                 self.bus.books().received(&own_topic);
                 self.leave_out(&skipped, &mut choice);
                 let fused = self.take_in(&own, &fused, &choice);
@@ -85,25 +85,25 @@ impl Node<'_> {
                 tracing::error!(capture_nanos, "a frame could not be fused: {error}");
                 self.report.failed += 1;
                 self.bus.books().dropped(&own_topic, DropReason::Shape);
-                // Nothing is wrong with the neighbours' messages.
+                // The neighbours' messages are valid.
                 self.take_in(&own, &(0..choice.views.len()).collect::<Vec<_>>(), &choice);
             }
         }
     }
 
-    /// What is known of those who were heard for a frame.
-    fn heard(&self, beliefs: &[(usize, Assessment)], views: &[View]) -> Vec<HeardNeighbour> {
-        let books = self.bus.books();
-        for (index, belief) in beliefs {
-            books.trusted(&views[*index].cav, belief.trust);
+    /// Report of the neighbours received for a frame.
+    fn neighbour_reports(&self, assessments: &[(usize, Assessment)], views: &[View]) -> Vec<HeardNeighbour> {
+        let stats = self.bus.books();
+        for (index, assessment) in assessments {
+            stats.trusted(&views[*index].cav, assessment.trust);
         }
-        let clocks = books.peers();
+        let clocks = stats.peers();
         let clock = |cav: &CavId| clocks.iter().find(|peer| peer.cav == *cav)?.clock_offset_s;
-        let heard = heard(beliefs, views).into_iter();
-        heard.map(|neighbour| HeardNeighbour { clock_offset_s: clock(&neighbour.cav), ..neighbour }).collect()
+        let reports = misbehaviour::heard(assessments, views).into_iter();
+        reports.map(|neighbour| HeardNeighbour { clock_offset_s: clock(&neighbour.cav), ..neighbour }).collect()
     }
 
-    /// The neighbours' messages for a frame, and who has none.
+    /// The neighbours' messages for a frame, and the neighbours without one.
     fn choose(&mut self, capture_nanos: u64) -> Choice {
         let (paired, dropped) = self.pairing.pair(capture_nanos);
         let mut choice = Choice::default();
@@ -111,16 +111,16 @@ impl Node<'_> {
             // A copy, as the message may serve the next frame too.
             choice.views.push(message.view.clone());
             let (payload_bytes, wire_bytes) = (message.payload_bytes, message.wire_bytes);
-            choice.books.push(Booking { is_first_use, payload_bytes, wire_bytes });
+            choice.messages.push(MessageInfo { is_first_use, payload_bytes, wire_bytes });
         }
         for lost in &dropped {
             self.bus.books().dropped(&self.topic(&lost.cav), lost.reason);
         }
         let Some(neighbourhood) = &mut self.neighbourhood else { return choice };
-        let spoke = |cav: &&CavId| choice.views.iter().any(|view| view.cav == **cav);
-        let silent: Vec<CavId> = neighbourhood.members().filter(|cav| !spoke(cav)).cloned().collect();
+        let has_sent = |cav: &&CavId| choice.views.iter().any(|view| view.cav == **cav);
+        let silent: Vec<CavId> = neighbourhood.members().filter(|cav| !has_sent(cav)).cloned().collect();
         for cav in silent {
-            neighbourhood.was_silent(&cav);
+            neighbourhood.missed(&cav);
             let lost = dropped.iter().rev().find(|lost| lost.cav == cav).map(|lost| lost.reason);
             let reason = if self.models.is_other(&cav) { Some(DropReason::Shape) } else { lost };
             choice.skipped.push(SkippedNeighbour { cav, reason });
@@ -128,13 +128,13 @@ impl Node<'_> {
         choice
     }
 
-    /// MessageStats the views that are in the result, and describes them.
+    /// Counts the views that are in the result as received, and describes them.
     fn take_in(&mut self, own: &View, fused: &[usize], choice: &Choice) -> Vec<FusedNeighbour> {
         self.report.fused += fused.len() as u64;
         let describe = |&index: &usize| {
             let view = &choice.views[index];
             let View { cav, pose, .. } = view;
-            let Booking { is_first_use, payload_bytes, wire_bytes } = choice.books[index];
+            let MessageInfo { is_first_use, payload_bytes, wire_bytes } = choice.messages[index];
             self.settle(cav, is_first_use, None);
             let (cav, age_nanos, confidence) = (cav.clone(), view.age_nanos(own), pose.confidence());
             FusedNeighbour { cav, age_nanos, confidence, payload_bytes, wire_bytes }
@@ -142,23 +142,23 @@ impl Node<'_> {
         fused.iter().map(describe).collect()
     }
 
-    /// MessageStats the views that are not in the result, and names those that should have been.
+    /// Counts the views that are not in the result, and names those that should have been.
     fn leave_out(&self, left_out: &[(usize, Skipped)], choice: &mut Choice) {
         for &(index, why) in left_out {
             let cav = choice.views[index].cav.clone();
             let reason = match why {
                 Skipped::Unusable(reason) => Some(reason),
-                // It was looked at, and rightly left out.
+                // It was evaluated, and rightly left out.
                 Skipped::NotNeeded => None,
             };
-            self.settle(&cav, choice.books[index].is_first_use, reason);
+            self.settle(&cav, choice.messages[index].is_first_use, reason);
             if reason.is_some() {
                 choice.skipped.push(SkippedNeighbour { cav, reason });
             }
         }
     }
 
-    /// MessageStats a message that was looked at, the first time it is.
+    /// Counts a message at its first use.
     fn settle(&self, cav: &CavId, is_first_use: bool, reason: Option<DropReason>) {
         let topic = self.topic(cav);
         match reason {
@@ -169,7 +169,7 @@ impl Node<'_> {
     }
 
     fn publish(&mut self, capture_nanos: u64, result: Detections) {
-        // The own message's transport is in the books already.
+        // The own message's transport is counted already.
         for stage in result.stages.iter().filter(|stage| stage.stage != "transport") {
             self.bus.books().timed(&stage.stage, Duration::from_nanos(stage.nanos));
         }

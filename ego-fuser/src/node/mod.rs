@@ -1,8 +1,8 @@
-//! An ego on the bus: its own agent's message and those of its neighbours in, detections out.
+//! Node of the ego on the bus: its own agent's message and those of its neighbours in, detections out.
 //!
 //! A frame begins with the message of the ego's own agent. It is decided when every neighbour's message of the same
-//! capture time has come, or when the deadline has passed; whatever comes later serves the next frame, if it is still
-//! young enough. One thread receives, fuses and offers; sending has threads of its own.
+//! capture time has arrived, or when the deadline has passed; later messages serve the next frame, if they are still
+//! young enough. One thread receives, fuses and publishes; sending has threads of its own.
 
 mod admit;
 mod decide;
@@ -18,39 +18,39 @@ use protocol::{CavId, DropReason, Limits, Role, Stream, Topic};
 
 use crate::config::{EgoConfig, EgoSettings};
 use crate::ego::{Ego, View};
-use crate::neighbourhood::{Neighbourhood, heard_on, sender_of};
+use crate::neighbourhood::{Neighbourhood, sender_of, topic_of};
 use crate::pairing::{Pairing, PairingConfig};
 use crate::peer_models::PeerModels;
 use fusion::method::Exchange;
 
-/// Messages of one sender that may wait while a frame is fused. An ego that needs longer than its frames' period answers
-/// frames that have waited this long, so no more than what a short pause costs.
+/// Messages of one sender that may wait while a frame is fused. An ego that needs longer than its frames' period
+/// answers frames that have waited this long, so it is no more than a short pause needs.
 const PLACES: usize = 2;
 /// Results that may wait to be sent.
 const RESULTS: usize = 4;
-/// Topics an ego listens to at most: of 65 vehicles, what they see and what they say of themselves.
+/// Largest number of subscribed topics: of 65 vehicles, their stream and their descriptor.
 const MAX_TOPICS: usize = 130;
-/// How often the node looks for newcomers though no message has come.
+/// Interval of checks for new agents while no message arrives.
 const LOOK_ROUND: Duration = Duration::from_millis(20);
-/// How long a node whose own agent has ended waits for the last words of its neighbours.
+/// Time that a node whose own agent has ended waits for the last messages of its neighbours.
 const LAST_WORDS: Duration = Duration::from_secs(2);
 
-/// How an ego takes part.
+/// Options of an ego node.
 #[derive(Debug, Clone)]
 pub struct NodeOptions {
-    /// How long a frame waits for its neighbours, from the arrival of the own agent's message.
+    /// Longest wait of a frame for its neighbours, from the arrival of the own agent's message.
     pub deadline: Duration,
-    /// Which messages belong together.
+    /// Pairing of messages with a frame.
     pub pairing: PairingConfig,
-    /// The neighbours that may take part; `None`: all that are found.
+    /// The neighbours that may take part; `None`: all that are discovered.
     pub neighbours: Option<BTreeSet<CavId>>,
-    /// Whether neighbours are heard behind the emulated air.
+    /// True if neighbours are received behind the link emulation.
     pub over_link: bool,
-    /// Whether to go on when the own agent has ended, for the next one.
+    /// True to continue when the own agent has ended, for its next instance.
     pub keeps_running: bool,
-    /// What it takes from the bus.
+    /// Limits of received messages.
     pub limits: Limits,
-    /// How much of that, from each sender and altogether.
+    /// Limits of the inbox, for each sender and in total.
     pub inbox: InboxLimits,
 }
 
@@ -62,7 +62,7 @@ impl Default for NodeOptions {
 }
 
 impl From<&EgoSettings> for NodeOptions {
-    /// All neighbours, heard directly, until the own agent ends.
+    /// All neighbours, received directly, until the own agent ends.
     fn from(settings: &EgoSettings) -> Self {
         Self {
             deadline: Duration::from_millis(settings.deadline_ms),
@@ -88,7 +88,7 @@ impl From<&EgoConfig> for NodeOptions {
     }
 }
 
-/// What an ego did.
+/// Summary of an ego's run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize)]
 pub struct NodeReport {
     /// Frames decided.
@@ -101,14 +101,14 @@ pub struct NodeReport {
     pub failed: u64,
 }
 
-/// RunScope `ego` for the vehicle `cav` on the calling thread until its agent ends or `stop` is requested.
+/// Runs `ego` for the vehicle `cav` on the calling thread until its agent ends or `stop` is requested.
 ///
 /// # Errors
-/// [`BusError`] when the bus refuses. What goes wrong with single messages is counted and logged.
+/// [`BusError`] of the bus. Errors of single messages are counted and logged.
 pub fn run(bus: &Bus, cav: &CavId, ego: Ego, options: &NodeOptions, stop: &Stop) -> Result<NodeReport, BusError> {
     let mut node = Node::open(bus, cav, ego, options, stop)?;
     let presence = bus.announce(Role::Ego)?;
-    node.listen(stop)?;
+    node.receive(stop)?;
     let Node { detections, json, report, .. } = node;
     detections.finish();
     json.finish();
@@ -116,7 +116,7 @@ pub fn run(bus: &Bus, cav: &CavId, ego: Ego, options: &NodeOptions, stop: &Stop)
     Ok(report)
 }
 
-/// A message as it came, decoded.
+/// A message as received, decoded.
 struct Received {
     view: View,
     payload_bytes: u64,
@@ -163,10 +163,10 @@ impl<'a> Node<'a> {
             move || inbox.close()
         });
         let topic = |stream| Topic::Stream { cav: cav.clone(), stream };
-        // Boxes and points are of no network.
+        // Boxes and points belong to no network.
         let streams = if stream == Stream::Bev { vec![Stream::Descriptor, stream] } else { vec![stream] };
         let own = streams.iter().map(|&stream| bus.subscribe(topic(stream), &inbox)).collect::<Result<_, _>>()?;
-        // Alone, an ego has nothing to hear from others.
+        // An ego-only method needs no messages of others.
         let neighbourhood = (ego.method().exchange() != Exchange::Nothing)
             .then(|| Neighbourhood::watch(bus, cav, streams, options.over_link, options.neighbours.clone()))
             .transpose()?;
@@ -190,7 +190,7 @@ impl<'a> Node<'a> {
         })
     }
 
-    fn listen(&mut self, stop: &Stop) -> Result<(), BusError> {
+    fn receive(&mut self, stop: &Stop) -> Result<(), BusError> {
         let _working = self.bus.works_from(&self.inbox);
         while !stop.requested() {
             self.look_round()?;
@@ -210,7 +210,7 @@ impl<'a> Node<'a> {
         Ok(())
     }
 
-    /// The own agent has ended: the frames that wait have their usual time, the neighbours' last messages are counted.
+    /// Ends after the own agent: the frames that wait have their usual time, the neighbours' last messages are counted.
     fn finish(&mut self, stop: &Stop) -> Result<(), BusError> {
         let until = Instant::now() + LAST_WORDS.max(self.options.deadline);
         while !stop.requested() && Instant::now() < until && !(self.frames.is_empty() && self.all_have_ended()) {
@@ -224,7 +224,7 @@ impl<'a> Node<'a> {
             self.decide(false);
         }
         self.decide(true);
-        // What waits for a frame that will not come.
+        // Messages that wait for a frame that will not come.
         let (_, dropped) = self.pairing.pair(u64::MAX);
         for lost in dropped {
             self.bus.books().dropped(&self.topic(&lost.cav), lost.reason);
@@ -232,7 +232,7 @@ impl<'a> Node<'a> {
         Ok(())
     }
 
-    /// A neighbour sends nothing to fuse any more.
+    /// Records the end of a neighbour's stream.
     fn end(&mut self, topic: Topic) {
         if let Some((cav, stream)) = sender_of(&topic)
             && stream == self.stream
@@ -259,7 +259,7 @@ impl<'a> Node<'a> {
     }
 
     fn topic(&self, cav: &CavId) -> Topic {
-        heard_on(&self.cav, cav, self.stream, self.options.over_link)
+        topic_of(&self.cav, cav, self.stream, self.options.over_link)
     }
 
     fn next_moment(&self) -> Instant {

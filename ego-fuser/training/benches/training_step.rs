@@ -1,4 +1,4 @@
-//! One training step of `lean` on made-up sweeps: what a sample costs in each precision.
+//! One training step of `lean` on synthetic sweeps: time per sample in each precision.
 //!
 //! `cargo bench -p ego-fuser --bench training_step -- bf16` runs one case.
 
@@ -23,7 +23,7 @@ const AGENTS: usize = 3;
 /// Samples of one step.
 const SAMPLES: usize = 2;
 
-/// A sweep as dense as a real one: rings on the ground, thinning out with distance.
+/// A sweep with realistic density: rings on the ground, sparser with distance.
 fn sweep(rng: &mut impl Rng) -> Vec<[f32; 4]> {
     (0..45_000)
         .map(|_| {

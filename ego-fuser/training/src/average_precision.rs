@@ -1,12 +1,12 @@
-//! Average precision of boxes seen from above, in both orderings that the field reports.
+//! Average precision of boxes in the plane, in both orderings that the field reports.
 //!
 //! Matching as in OpenCOOD: detections of a frame by falling score, each takes the remaining object with the highest
 //! overlap of the rotated footprints; below the threshold it is a false positive, otherwise a true positive, and the
 //! object is gone. AP is the area under the interpolated curve over all points (VOC 2010).
 //!
-//! The two orderings of the concatenated list differ by many points, so a number without its ordering says little:
-//! [`Ordering::Global`] sorts by score over all frames; [`Ordering::Frame`] keeps the frames one after another (the
-//! default of OpenCOOD).
+//! The two orderings of the concatenated list differ by many percentage points, so a number without its ordering is of
+//! little use: [`Ordering::Global`] sorts by score over all frames; [`Ordering::Frame`] keeps the frames one after
+//! another (the default of OpenCOOD).
 
 use perception::boxes::postprocess;
 use protocol::rotated_iou::Polygon;
@@ -15,7 +15,7 @@ use protocol::{Box3d, Detection};
 /// Overlaps at which AP is reported.
 pub const THRESHOLDS: [f64; 3] = [0.3, 0.5, 0.7];
 
-/// Whether the list of detections is sorted over all frames.
+/// Order of the list of detections.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Ordering {
     /// By score over all frames.
@@ -29,14 +29,14 @@ pub enum Ordering {
 pub struct Matched {
     /// Confidence of the detection.
     pub score: f32,
-    /// Whether it found an object.
+    /// True if it matched an object.
     pub is_true: bool,
 }
 
 /// Precision over recall, and the area under it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Curve {
-    /// Average precision, 0..1; 0 where there was nothing to find.
+    /// Average precision, 0..1; 0 without objects.
     pub average_precision: f64,
     /// Recall after each detection, with 0 in front and 1 at the end.
     pub recall: Vec<f64>,
@@ -205,7 +205,7 @@ mod tests {
     #[test]
     fn the_loser_of_the_best_object_may_still_find_another() {
         let mut scorer = Scorer::new(&[0.3]);
-        // Both detections overlap the first object most; the second settles for the other one.
+        // Both detections overlap the first object most; the second takes the other one.
         scorer.add(&[found(0.0, 0.9), found(0.6, 0.8)], &[car(0.2), car(2.0)]);
         assert!(scorer.tallies()[0].matched.iter().all(|entry| entry.is_true));
     }

@@ -1,9 +1,9 @@
-//! The maps of a frozen encoder, computed once and kept on disk.
+//! Feature store: maps of a frozen encoder, computed once and kept on disk.
 //!
-//! Methods that share an encoder differ in what they make of its maps; what takes the time, the encoder, need not run
-//! again for each of them, nor for each pass over the data. The file belongs to one encoder, one set of data (its contents)
-//! and one wire version: all are in its name. It holds one packed message per sweep, as on the wire, each after its length: what
-//! is cut off or changed is found out.
+//! Methods with a common encoder differ in the fusion of its maps; the encoder, which takes most of the time, need not
+//! run again for each of them, nor for each pass over the data. The file belongs to one encoder, one set of data (its
+//! contents) and one wire version: all are in its name. It holds one packed message per sweep, as on the wire, each
+//! after its length: truncated or changed messages are detected.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Write};
@@ -27,15 +27,15 @@ const HASH_DIGITS: usize = 12;
 /// zstd level of a message: more costs time and saves nothing.
 const PACKING: i32 = 1;
 
-/// Why maps cannot be kept or read.
+/// Error of storing or reading maps.
 #[derive(Debug, thiserror::Error)]
 pub enum FeatureStoreError {
-    /// The system refused.
+    /// The operating system reported an error.
     #[error("{}: {source}", path.display())]
     Io {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// Error of the operating system.
         source: io::Error,
     },
     /// A map cannot be packed or unpacked.
@@ -43,7 +43,7 @@ pub enum FeatureStoreError {
     Wire {
         /// The file.
         path: PathBuf,
-        /// What is wrong.
+        /// Cause.
         source: WireError,
     },
     /// A sweep cannot be read.
@@ -52,28 +52,28 @@ pub enum FeatureStoreError {
     /// The encoder's weights cannot be used.
     #[error(transparent)]
     Weights(#[from] WeightsError),
-    /// The encoder refused.
+    /// The encoder reported an error.
     #[error(transparent)]
     Detector(#[from] DetectorError),
-    /// The tensor library refused.
+    /// The tensor library reported an error.
     #[error("kept maps: {0}")]
     Torch(#[from] TchError),
 }
 
-/// Where maps are kept, how exactly and how many.
+/// Folder, numeric type and largest size of stored maps.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct KeptMaps {
-    /// The folder; a file per encoder, contents of the data and kind of number.
+    /// The folder; a file per encoder, contents of the data and numeric type.
     pub folder: PathBuf,
-    /// How exactly.
+    /// Numeric type of the values.
     pub dtype: Dtype,
-    /// Size of a file at most, bytes; sweeps beyond are encoded whenever they are needed.
+    /// Largest size of a file, bytes; sweeps beyond are encoded whenever they are needed.
     pub limit_bytes: u64,
-    /// Scale of the intensities that were encoded: maps of another scale are other maps.
+    /// Scale of the intensities that were encoded: another scale gives other maps.
     pub intensity_scale: IntensityScale,
 }
 
-/// Whether a parameter is one of the encoder.
+/// True if a parameter belongs to the encoder.
 #[must_use]
 pub fn is_encoder(name: &str) -> bool {
     ["pillar_vfe.", "backbone.", "shrink_conv."].iter().any(|prefix| name.starts_with(prefix))
@@ -87,18 +87,18 @@ pub struct FeatureStore {
     dtype: Dtype,
     /// Names of the scenarios.
     names: Vec<String>,
-    /// Place of each scenario's first sweep, and of the end.
+    /// Index of each scenario's first sweep, and of the end.
     first: Vec<usize>,
     /// Ticks of each scenario.
     ticks: Vec<usize>,
-    /// Where each message that is there begins, and where the last one ends.
+    /// Offset of each message in the file, and the end of the last one, bytes.
     starts: Vec<u64>,
 }
 
 impl FeatureStore {
-    /// Opens the file of these scenarios and encodes what it does not have yet, up to its size.
+    /// Opens the file of these scenarios and encodes the missing sweeps, up to its size.
     ///
-    /// `on_sweep` is told how many sweeps are there, and of how many. An interrupted run is gone on with.
+    /// `on_sweep` gets the number of stored sweeps and of all. An interrupted run is continued.
     ///
     /// # Errors
     /// [`FeatureStoreError`] names the file.
@@ -120,10 +120,10 @@ impl FeatureStore {
         let io = |source| FeatureStoreError::Io { path: path.clone(), source };
         fs::create_dir_all(&kept.folder).map_err(io)?;
         let file = OpenOptions::new().create(true).read(true).append(true).open(&path).map_err(io)?;
-        // Of two trainings that begin together one encodes, the other waits for it.
+        // Of two trainings that start together one encodes, the other waits for it.
         file.lock().map_err(io)?;
         let starts = starts(&file).map_err(io)?;
-        // A message that was cut off is made anew.
+        // A truncated message is encoded again.
         file.set_len(starts[starts.len() - 1]).map_err(io)?;
         let mut first = vec![0];
         for scenario in scenarios {
@@ -158,7 +158,7 @@ impl FeatureStore {
                     return Ok(());
                 }
                 let (agent, tick) = (sweep / self.ticks[index], sweep % self.ticks[index]);
-                // A sweep that is absent or cannot be read has an empty place.
+                // A sweep that is absent or cannot be read has an empty entry.
                 let message = match scenario.load(agent, tick, &LoadOptions::default()) {
                     Ok(frame) => {
                         let map = detector.encode(&frame.points)?.features;
@@ -178,7 +178,7 @@ impl FeatureStore {
 
     fn packed(&self, features: BevFeatures) -> Result<Vec<u8>, FeatureStoreError> {
         let codec = CodecConfig { dtype: self.dtype, zstd_level: Some(PACKING), ..CodecConfig::default() };
-        // Whose map it is, and when, is told by its place.
+        // Sender and time of a map follow from its index.
         let cav = CavId::new("0").map_err(|_| self.io(io::ErrorKind::InvalidInput.into()))?;
         let stamp = Stamp { cav, epoch: 0, sequence: 0, capture_nanos: 0, publish_nanos: 0 };
         let pose = PoseEstimate::NoPose { reason: NoPoseReason::NoSource, inlier_count: 0 };
@@ -189,7 +189,7 @@ impl FeatureStore {
         encode().map_err(|source| FeatureStoreError::Wire { path: self.path.clone(), source })
     }
 
-    /// The map of a sweep, `[1, C, H, W]`, by scenario, agent and tick; nothing where it did not fit or the sweep could
+    /// The map of a sweep, `[1, C, H, W]`, by scenario, agent and tick; `None` where it did not fit or the sweep could
     /// not be read.
     ///
     /// # Errors
@@ -220,7 +220,7 @@ impl FeatureStore {
         self.names.iter().position(|name| name == scenario)
     }
 
-    /// Sweeps that are there, and all of the scenarios.
+    /// Number of stored sweeps, and of all sweeps of the scenarios.
     #[must_use]
     pub fn sweeps(&self) -> (usize, usize) {
         (self.starts.len() - 1, self.first[self.first.len() - 1])
@@ -235,10 +235,10 @@ impl FeatureStore {
     }
 }
 
-/// Bytes that tell the length of the message behind them.
+/// Bytes of the length before each message.
 const LENGTH_BYTES: u64 = 4;
 
-/// Where each whole message of a file begins, and where the last one ends.
+/// Offset of each complete message of a file, and the end of the last one.
 fn starts(file: &File) -> io::Result<Vec<u64>> {
     let end = file.metadata()?.len();
     let mut starts = vec![0];
@@ -257,7 +257,7 @@ fn starts(file: &File) -> io::Result<Vec<u64>> {
     }
 }
 
-/// Maps from a store, and from the encoder where that has none.
+/// Maps from a store, and from the encoder for sweeps that it does not hold.
 #[derive(Debug)]
 pub struct MapSource {
     store: Arc<FeatureStore>,
@@ -266,7 +266,7 @@ pub struct MapSource {
 }
 
 impl Clone for MapSource {
-    /// The encoder is made anew where it is needed: every thread has its own.
+    /// The encoder is built anew where it is needed: every thread has its own.
     fn clone(&self) -> Self {
         Self { store: Arc::clone(&self.store), weights: Arc::clone(&self.weights), encoder: None }
     }

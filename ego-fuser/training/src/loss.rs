@@ -1,16 +1,17 @@
-//! The detection loss: sigmoid focal loss on scores, smooth L1 on boxes with the sine of the yaw difference.
+//! Detection loss: sigmoid focal loss on scores, smooth L1 on boxes with the sine of the yaw difference.
 //!
-//! As PointPillars and OpenCOOD define it: per sample divided by its number of positives (at least one), summed, divided
-//! by the batch size.
+//! As PointPillars and OpenCOOD define it: per sample divided by its number of positives (at least one), summed,
+//! divided by the batch size.
 
 use tch::{Device, Kind, TchError, Tensor};
 
 use crate::samples::Offset;
 use fusion::targets::{BOX_CODE, Labels};
 
-/// What a turn by a radian weighs against a shift by a metre: about the distance at which neighbours see what the ego sees.
+/// Weight of a rotation by a radian relative to a shift by a metre: about the distance of objects that two neighbours
+/// share.
 const METRES_PER_RADIAN: f64 = 20.0;
-/// What is left of a pose's error beyond this is not undone by looking at maps from near, metres.
+/// Remaining pose errors beyond this are out of the range of FSA and not trained, metres.
 const RECOVERABLE_M: f64 = 5.0;
 
 /// Weights and shapes of the two terms.
@@ -18,18 +19,18 @@ const RECOVERABLE_M: f64 = 5.0;
 pub struct LossConfig {
     /// Focal loss: share of the positives.
     pub alpha: f64,
-    /// Focal loss: exponent that quietens easy anchors.
+    /// Focal loss: exponent that reduces the weight of easy anchors.
     pub gamma: f64,
-    /// Smooth L1: where the square ends.
+    /// Smooth L1: end of the quadratic part.
     pub beta: f64,
     /// Weight of the classification term.
     pub score_weight: f64,
     /// Weight of the regression term.
     pub box_weight: f64,
-    /// Weight of the alignment term: how far a fusion's own corrections of poses are from the errors that were put on top
-    /// of them. None: the detection loss alone teaches a fusion to align, as in the paper.
+    /// Weight of the alignment term: the difference of a fusion's own pose corrections from the errors that were added.
+    /// 0: only the detection loss trains the alignment, as in the paper.
     pub alignment_weight: f64,
-    /// What unassigned anchors count as.
+    /// Treatment of unassigned anchors.
     pub unassigned: Unassigned,
 }
 
@@ -47,12 +48,12 @@ impl Default for LossConfig {
     }
 }
 
-/// What the loss does with anchors between the two overlap thresholds.
+/// Treatment of anchors between the two overlap thresholds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Unassigned {
-    /// They count as background: what OpenCOOD does.
+    /// They count as background: the behaviour of OpenCOOD.
     Background,
-    /// They count for nothing: what its label generator intends.
+    /// They are ignored: the intention of its label generator.
     Ignored,
 }
 
@@ -66,7 +67,7 @@ pub struct Loss {
 }
 
 impl Loss {
-    /// What is minimised.
+    /// The minimised sum.
     pub fn total(&self) -> Tensor {
         &self.score + &self.boxes
     }
@@ -140,10 +141,11 @@ pub fn detection_loss(
     Ok(Loss { score, boxes })
 }
 
-/// How far corrections are from what would undo the errors put on poses: smooth L1 per view, mean over views and samples.
+/// Difference of corrections from those that undo the added pose errors: smooth L1 per view, mean over views and
+/// samples.
 ///
-/// A turn by a radian counts as a shift by 20 m. No true pose takes part: an error that was put on top is
-/// known whatever lies below. Where more than 5 m are left nothing is asked: such a map was not found from afar.
+/// A rotation by a radian counts as a shift by 20 m. No true pose is used: an added error is known whatever the pose it
+/// was added to. Where more than 5 m are left the term is zero: such a map was not found by the search.
 ///
 /// # Errors
 /// [`TchError`] when a sample has other views than offsets.
@@ -172,7 +174,7 @@ fn focal_loss(scores: &Tensor, labels: &LabelTensors, config: &LossConfig) -> Re
     let logits = scores.f_to_kind(Kind::Float)?.f_permute([0, 2, 3, 1])?.f_reshape(target.size())?;
     let probability = logits.f_sigmoid()?;
     let background: Tensor = 1.0 - target;
-    // 1 - p_t of the paper: how wrong the prediction is.
+    // 1 - p_t of the paper: error of the prediction.
     let wrong: Tensor = target * (1.0 - &probability) + &background * &probability;
     let balance = target * config.alpha + &background * (1.0 - config.alpha);
     let entropy =
@@ -240,15 +242,15 @@ mod tests {
             alignment_loss(corrections, offsets).unwrap().double_value(&[])
         };
         assert!(loss(&[Some(undone.shallow_clone())], &offsets) < 1e-12);
-        // Nothing moved: |1|, |-0.5|, 20 m * |0.02|, |2| by smooth L1, over six numbers.
+        // No correction: |1|, |-0.5|, 20 m * |0.02|, |2| by smooth L1, over six numbers.
         let still = Tensor::zeros([2, 3], (Kind::Float, Device::Cpu)).set_requires_grad(true);
         let expected = (0.5 + 0.125 + 0.08 + 1.5) / 6.0;
         assert!((loss(&[Some(still.shallow_clone())], &offsets) - expected).abs() < 1e-6);
         alignment_loss(&[Some(still.shallow_clone()), None], &[offsets[0].clone(), vec![]]).unwrap().backward();
         assert!(still.grad().double_value(&[0, 0]) < 0.0, "towards the offset");
         let lost = vec![vec![Offset::default(), Offset([9.0, 0.0, 0.0]), Offset([0.0, 0.0, 1.0])]];
-        assert_eq!(loss(&[Some(still.detach())], &lost), 0.0, "of a lost vehicle nothing is asked");
-        assert_eq!(loss(&[None], &[vec![Offset::default()]]), 0.0, "an ego alone has nothing to align");
+        assert_eq!(loss(&[Some(still.detach())], &lost), 0.0, "a lost vehicle has no alignment loss");
+        assert_eq!(loss(&[None], &[vec![Offset::default()]]), 0.0, "ego-only there is nothing to align");
     }
 
     #[test]

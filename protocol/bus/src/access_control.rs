@@ -1,40 +1,40 @@
-//! What a router lets through: [`protocol::access`] as rules of zenoh's.
+//! Access control: [`protocol::access`] as access-control rules of zenoh.
 //!
-//! Everything is refused that no rule allows, in both directions. A rule holds for a certificate by its common name;
-//! which name a peer has is settled by the handshake and not by anything the peer says.
+//! Everything that no rule allows is denied, in both directions. A rule applies to a certificate by its common name;
+//! the handshake authenticates the name.
 
 use std::collections::BTreeMap;
 
 use protocol::{KeyExpr, Operation, Permission, Principal, RunScope, access};
 use serde_json::{Value, json};
 
-/// The parties that a router lets in, and for which runs.
+/// Principals that a router admits, and their runs.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct AccessControl {
-    /// Who.
+    /// Principals that may connect.
     pub members: Vec<Principal>,
-    /// Where.
+    /// Runs in which their permissions hold.
     pub runs: RunScope,
 }
 
 impl AccessControl {
     /// zenoh's `access_control`.
     pub(super) fn rules(&self) -> Value {
-        // Publishers ask the router who listens, so as not to send what nobody wants.
-        let who_listens = json!({
-            "id": LISTENERS,
+        // Publishers ask the router for subscribers, so that they do not send messages without any.
+        let subscriber_rule = json!({
+            "id": SUBSCRIBERS_RULE,
             "permission": "allow",
             "flows": ["egress"],
             "messages": ["declare_subscriber"],
             "key_exprs": KeyExpr::all_of(&self.runs).each_ref().map(KeyExpr::as_str),
         });
-        let mut rules = vec![who_listens];
+        let mut rules = vec![subscriber_rule];
         let (mut subjects, mut policies) = (Vec::new(), Vec::new());
         for member in &self.members {
             let name = member.to_string();
             let own = rules_of(&name, &member.rights(&self.runs));
             let names: Vec<Value> =
-                [json!(LISTENERS)].into_iter().chain(own.iter().map(|rule| rule["id"].clone())).collect();
+                [json!(SUBSCRIBERS_RULE)].into_iter().chain(own.iter().map(|rule| rule["id"].clone())).collect();
             rules.extend(own);
             subjects.push(json!({"id": name, "cert_common_names": [name], "link_protocols": ["quic"]}));
             policies.push(json!({"id": name, "rules": names, "subjects": [name]}));
@@ -49,7 +49,7 @@ impl AccessControl {
     }
 }
 
-/// zenoh's `low_pass_filter`: what is larger than any message of its key goes no further than the router.
+/// zenoh's `low_pass_filter`: the router rejects messages above the size limit of their key.
 pub(super) fn size_limits() -> Value {
     let limits = access::size_limits().into_iter().enumerate().map(|(index, (keys, bytes))| {
         json!({
@@ -63,9 +63,9 @@ pub(super) fn size_limits() -> Value {
     limits.collect()
 }
 
-const LISTENERS: &str = "who-listens";
+const SUBSCRIBERS_RULE: &str = "subscribers";
 
-/// Two rules for every act: what comes from the party, and what goes to it.
+/// Two rules for every operation: messages from the principal, and messages to it.
 fn rules_of(name: &str, rights: &[Permission]) -> Vec<Value> {
     let mut keys: BTreeMap<Operation, Vec<&str>> = BTreeMap::new();
     for right in rights {
@@ -105,10 +105,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn nobody_may_answer_questions_or_delete() {
+    fn no_principal_may_answer_queries_or_delete() {
         let members = ["agent-1", "ego-1", "link-1", "replay", "scorer", "recorder", "viewer"];
-        let guard = AccessControl { members: members.map(|name| name.parse().unwrap()).into(), runs: RunScope::Any };
-        let rules = guard.rules();
+        let access_control =
+            AccessControl { members: members.map(|name| name.parse().unwrap()).into(), runs: RunScope::Any };
+        let rules = access_control.rules();
         assert_eq!(rules["default_permission"], "deny");
         let rules = rules["rules"].as_array().unwrap();
         for rule in rules {
@@ -118,6 +119,6 @@ mod tests {
             assert!(messages.iter().all(|message| !never.contains(&message.as_str().unwrap())), "{rule}");
         }
         let ids: std::collections::BTreeSet<&str> = rules.iter().map(|rule| rule["id"].as_str().unwrap()).collect();
-        assert_eq!(ids.len(), rules.len(), "zenoh wants every rule to have a name of its own");
+        assert_eq!(ids.len(), rules.len(), "zenoh requires a unique id per rule");
     }
 }

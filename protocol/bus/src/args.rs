@@ -1,4 +1,4 @@
-//! Configuration that every process of a fleet shares: the connection to its run, and limits of what others send.
+//! Configuration shared by all processes of a fleet: connection to the run, and limits on received messages.
 
 use std::io::IsTerminal;
 use std::net::SocketAddr;
@@ -17,7 +17,7 @@ use super::handshake_failures::HandshakeCounter;
 use super::shutdown::Stop;
 use super::{Bus, BusError, BusOptions, Credentials, Endpoint, Identity, InboxLimits, process_id};
 
-/// How long a process may take to end after it was asked to: within the 5 s that a whole fleet has.
+/// Maximum duration of a shutdown after the request: within the 5 s of a whole fleet.
 pub const STOP_LIMIT: Duration = Duration::from_secs(4);
 
 /// Connection of a process to the router of its run.
@@ -25,29 +25,30 @@ pub const STOP_LIMIT: Duration = Duration::from_secs(4);
 #[serde(default, deny_unknown_fields)]
 #[command(next_help_heading = "Bus")]
 pub struct BusConfig {
-    /// The router to connect to, tcp/HOST:PORT, or quic/HOST:PORT with keys.
+    /// Router to connect to, tcp/HOST:PORT, or quic/HOST:PORT with keys.
     #[arg(long)]
     pub connect: Endpoint,
-    /// Be the run's router oneself and listen here, tcp/HOST:PORT; no launcher or zenohd is needed then.
+    /// Act as the run's router and listen here, tcp/HOST:PORT; no launcher or zenohd is needed then.
     #[arg(long, conflicts_with = "connect")]
     pub listen: Option<Endpoint>,
-    /// Folder with the keys of this process (ca.pem, cert.pem, key.pem): connect over QUIC, show the certificate and
-    /// take no router without one. `v2vloc keys` makes them.
+    /// Folder with the keys of this process (ca.pem, cert.pem, key.pem): connect over QUIC, present the certificate and
+    /// reject a router without one. `v2vloc keys` creates them.
     #[arg(long, value_name = "DIR")]
     pub keys: Option<PathBuf>,
-    /// Longest time to go on trying to reach the router, seconds.
+    /// Maximum time of trying to reach the router, seconds.
     #[arg(long, value_name = "S")]
     pub connect_timeout_s: f64,
-    /// Shared memory for large messages between processes of one machine, MiB; 0: none, everything takes the socket.
+    /// Shared memory for large messages between processes of one machine, MiB; 0: none, all messages use the socket.
     #[arg(long, value_name = "MIB")]
     pub shared_memory_mib: usize,
     /// Largest message accepted from outside, MiB.
     #[arg(long, value_name = "MIB")]
     pub max_message_mib: usize,
-    /// Serve counters and times of this process to Prometheus at http://HOST:PORT/metrics; port 0: any free one.
+    /// Serve counters and stage durations of this process to Prometheus at http://HOST:PORT/metrics; port 0: any free
+    /// port.
     #[arg(long, value_name = "HOST:PORT")]
     pub metrics: Option<SocketAddr>,
-    /// End when standard input ends: for a supervisor that holds the other end of the pipe.
+    /// End at the end of standard input: for a supervisor that holds the other end of the pipe.
     #[arg(long)]
     pub supervised: bool,
 }
@@ -71,17 +72,17 @@ impl BusConfig {
     /// Checks the values.
     ///
     /// # Errors
-    /// [`FieldError`] for the first that is not allowed.
+    /// [`FieldError`] for the first value that is not allowed.
     pub fn validate(&self) -> Result<(), FieldError> {
         within("bus.connect_timeout_s", self.connect_timeout_s, 0.0, 1e6)?;
         within("bus.max_message_mib", self.max_message_mib, 1, 1 << 20)?;
         within("bus.shared_memory_mib", self.shared_memory_mib, 0, 1 << 20)
     }
 
-    /// The session that the configuration asks for.
+    /// Options of the session for this configuration.
     ///
     /// # Errors
-    /// [`BusError::Keys`] when there is something wrong with those of `keys`.
+    /// [`BusError::Keys`] when the files of `keys` are invalid.
     pub fn options(&self) -> Result<BusOptions, BusError> {
         let mut options = match &self.listen {
             Some(listen) => BusOptions::router(listen.clone()),
@@ -99,7 +100,7 @@ impl BusConfig {
     /// Joins `run` in a role.
     ///
     /// # Errors
-    /// [`BusError`] names the endpoint and what to do.
+    /// [`BusError`] states the endpoint and the remedy.
     pub fn join(&self, run: &RunId, role: Role, cav: &CavId) -> Result<Bus, BusError> {
         let identity = Identity { run: run.clone(), process: process_id(role, cav), cav: cav.clone() };
         let options = self.options()?;
@@ -114,7 +115,7 @@ impl BusConfig {
         Ok(bus)
     }
 
-    /// A request to end that follows signals and, where asked for, the end of standard input, and that is enforced.
+    /// A stop request that follows signals and, if configured, the end of standard input, and that is enforced.
     ///
     /// # Errors
     /// When handlers or threads cannot be installed.
@@ -129,15 +130,15 @@ impl BusConfig {
     }
 }
 
-/// Limits of what other vehicles may send to a process that listens to them.
+/// Limits on messages of other vehicles to a process that subscribes to them.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema, clap::Args)]
 #[serde(default, deny_unknown_fields)]
-#[command(next_help_heading = "Limits of what others send")]
+#[command(next_help_heading = "Limits on received messages")]
 pub struct InboxConfig {
-    /// Messages of one sender per second; what exceeds them is dropped unread (`rate_limit` in the ledger).
+    /// Messages per second of one sender; messages beyond are dropped unread (`rate_limit` in the ledger).
     #[arg(id = "inbox_messages_per_s", long = "inbox-messages-per-s", value_name = "N")]
     pub messages_per_s: f64,
-    /// MiB of one sender per second, on each of its streams.
+    /// MiB per second of one sender, on each of its streams.
     #[arg(id = "inbox_mib_per_s", long = "inbox-mib-per-s", value_name = "MIB")]
     pub mib_per_s: f64,
     /// MiB that may wait to be decoded, of all senders together.
@@ -158,13 +159,13 @@ impl InboxConfig {
     /// Checks the values.
     ///
     /// # Errors
-    /// [`FieldError`] for the first that is not allowed.
+    /// [`FieldError`] for the first value that is not allowed.
     pub fn validate(&self) -> Result<(), FieldError> {
         above_zero("inbox.messages_per_s", self.messages_per_s)?;
         above_zero("inbox.mib_per_s", self.mib_per_s)
     }
 
-    /// The same in bytes.
+    /// The limits in bytes.
     #[must_use]
     pub fn limits(&self) -> InboxLimits {
         InboxLimits {
@@ -175,13 +176,13 @@ impl InboxConfig {
     }
 }
 
-/// Sends the log to standard error: warnings, and what this program's own crates say at `info` and above, unless
-/// `RUST_LOG` says otherwise. Handshakes that fail are counted ([`super::RejectionLog`]) and not each written down.
+/// Writes the log to standard error: warnings, and messages of this program's own crates at `info` and above, unless
+/// `RUST_LOG` sets another filter. Failed handshakes are counted ([`super::RejectionLog`]) and not logged one by one.
 pub fn log_to_stderr() {
     const OURS: &str = "warn,zenoh_link_commons::quic=error,\
                         protocol=info,sim_replay=info,agent=info,ego_fuser=info,deploy=info";
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(OURS));
-    // Colours are for terminals: a supervisor sends this into a file.
+    // Colours are for terminals: a supervisor redirects the log into a file.
     let to_stderr =
         tracing_subscriber::fmt::layer().with_writer(std::io::stderr).with_ansi(std::io::stderr().is_terminal());
     // A second call, in tests, changes nothing.

@@ -1,18 +1,19 @@
-//! Threads that may be woken without taking the place of who wakes them.
+//! Batch scheduling: runs helper threads under `SCHED_BATCH` so that waking one does not preempt the waker.
 
 use rustix::process::{getpriority_process, setpriority_process};
 use thread_priority::{
     NormalThreadSchedulePolicy, ThreadPriority, ThreadSchedulePolicy, set_thread_priority_and_policy, thread_native_id,
 };
 
-/// Lets the calling thread wait for its turn when it is woken; it computes as much as before.
+/// Sets the batch policy for the calling thread: a woken thread waits for its turn; its share of the processor is
+/// unchanged.
 ///
-/// Linux gives the processor of whoever wakes a thread to that thread at once, when it has slept long enough. On a machine
-/// with nothing to spare a clock that hands a map to its sending thread came back from that 8 to 13 ms later, when the
-/// map was written. Threads of the policy `SCHED_BATCH` never do that.
+/// Linux may give the processor of the waking thread to the woken thread at once, if the latter has slept long enough.
+/// On a fully loaded machine the clock thread, after handing a feature map to its sending thread, continued 8 to 13 ms
+/// later, when the map was written. Threads of the policy `SCHED_BATCH` never preempt.
 pub(super) fn use_batch_scheduling() {
     let Ok(niceness) = getpriority_process(None) else { return };
-    // The call sets a niceness too: one that only root may have. Whether it got it or not, it is put back.
+    // The call also sets a niceness, which only root may set. In either case the old niceness is restored.
     let policy = ThreadSchedulePolicy::Normal(NormalThreadSchedulePolicy::Batch);
     let _ = set_thread_priority_and_policy(thread_native_id(), ThreadPriority::Max, policy);
     let _ = setpriority_process(None, niceness);

@@ -1,4 +1,4 @@
-//! One process on the bus of one run.
+//! Bus: connection of one process to one run.
 
 use std::hash::{BuildHasher, RandomState};
 use std::net::SocketAddr;
@@ -22,25 +22,25 @@ use super::subscriber::{Inbox, Subscription};
 use super::watchdog::Heartbeat;
 use super::{BusError, BusOptions, MessageStats, open};
 
-/// Who joins which run.
+/// Identity of a process in a run.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Identity {
     /// The run.
     pub run: RunId,
     /// The process, for the ledger: `agent-4279`.
     pub process: ProcessId,
-    /// The vehicle it speaks for, or a name of its own: `replay`.
+    /// The vehicle of the process, or a name of its own: `replay`.
     pub cav: CavId,
 }
 
-/// A process's place on the bus: everything it publishes, subscribes to and says goes through here.
+/// Connection of a process to the bus: everything that it publishes and subscribes to passes through it.
 pub struct Bus {
     session: Session,
     identity: Identity,
     epoch: u64,
-    books: MessageStats,
-    notices: StatusPublisher,
-    speaking: JoinHandle<()>,
+    stats: MessageStats,
+    status: StatusPublisher,
+    status_thread: JoinHandle<()>,
     metrics: Option<MetricsServer>,
 }
 
@@ -56,31 +56,30 @@ impl Bus {
     /// Joins the run over a session that is open already.
     ///
     /// # Errors
-    /// [`BusError::Thread`] when the system gives no thread.
+    /// [`BusError::Thread`] when the system cannot start a thread.
     pub fn over(session: Session, identity: Identity) -> Result<Self, BusError> {
-        let (epoch, books, notices) =
-            (new_epoch(), MessageStats::new(identity.process.clone()), StatusPublisher::new());
-        let speaking = notices.speak(StatusSender {
+        let (epoch, stats, status) = (new_epoch(), MessageStats::new(identity.process.clone()), StatusPublisher::new());
+        let status_thread = status.start(StatusSender {
             session: session.clone(),
             run: identity.run.clone(),
             cav: identity.cav.clone(),
             epoch,
-            books: books.clone(),
+            stats: stats.clone(),
         })?;
-        Ok(Self { session, identity, epoch, books, notices, speaking, metrics: None })
+        Ok(Self { session, identity, epoch, stats, status, status_thread, metrics: None })
     }
 
-    /// Serves the books to Prometheus for as long as this is; tells where.
+    /// Serves the counters to Prometheus until this is dropped; returns the address.
     ///
     /// # Errors
-    /// [`BusError::Metrics`] when the address cannot be listened at.
+    /// [`BusError::Metrics`] when the address cannot be bound.
     pub fn serve_metrics(&mut self, address: SocketAddr) -> Result<SocketAddr, BusError> {
         let server =
-            MetricsServer::start(address, &self.books).map_err(|cause| BusError::Metrics { address, cause })?;
+            MetricsServer::start(address, &self.stats).map_err(|cause| BusError::Metrics { address, cause })?;
         Ok(self.metrics.insert(server).address())
     }
 
-    /// Who this process is.
+    /// Identity of this process.
     #[must_use]
     pub fn identity(&self) -> &Identity {
         &self.identity
@@ -89,45 +88,46 @@ impl Bus {
     /// Its ledger and stage timings.
     #[must_use]
     pub fn books(&self) -> &MessageStats {
-        &self.books
+        &self.stats
     }
 
-    /// The session, for what this type does not do.
+    /// The zenoh session, for operations that this type does not offer.
     #[must_use]
     pub fn session(&self) -> &Session {
         &self.session
     }
 
-    /// A publisher of `topic` that speaks for this process's vehicle.
+    /// A publisher of `topic` on behalf of this process's vehicle.
     ///
     /// # Errors
-    /// [`BusError`] when zenoh or the system refuses.
+    /// [`BusError`] when zenoh or the system fails.
     pub fn publisher(&self, topic: Topic, options: PublisherOptions) -> Result<Publisher, BusError> {
-        // A sensor message is sent under the vehicle it belongs to.
+        // A sensor message names the vehicle that it belongs to.
         let cav = match &topic {
             Topic::Stream { cav, .. } | Topic::Received { cav, .. } => cav.clone(),
             _ => self.identity.cav.clone(),
         };
         let key = topic.in_run(&self.identity.run);
-        Publisher::new(&self.session, (&key, &cav), self.epoch, &self.books, options)
+        Publisher::new(&self.session, (&key, &cav), self.epoch, &self.stats, options)
     }
 
     /// An inbox of `places` messages for each of at most `max_topics` topics.
     #[must_use]
     pub fn inbox(&self, places: usize, max_topics: usize) -> Arc<Inbox> {
-        Inbox::new(places, max_topics, &self.books)
+        Inbox::new(places, max_topics, &self.stats)
     }
 
-    /// An inbox that takes no more than `limits` from anyone.
+    /// An inbox with `limits` on each sender.
     #[must_use]
     pub fn limited_inbox(&self, places: usize, max_topics: usize, limits: InboxLimits) -> Arc<Inbox> {
-        Inbox::within(limits, places, max_topics, &self.books)
+        Inbox::within(limits, places, max_topics, &self.stats)
     }
 
-    /// Until what is returned is dropped, this process says how it is only while a thread works from `inbox`: waits there or
-    /// has come back since the last time. One whose work stands still falls silent so, and whoever watches over it can tell.
+    /// Until the heartbeat is dropped, this process publishes its status only while a thread works from `inbox`: it
+    /// waits there or has returned since the last status. A stalled process thus stops its heartbeats, which a
+    /// supervisor detects.
     pub fn works_from(&self, inbox: &Inbox) -> Heartbeat {
-        Heartbeat::begin(&self.notices, inbox.pulse())
+        Heartbeat::begin(&self.status, inbox.watchdog())
     }
 
     /// Delivers `topic` into `inbox`.
@@ -135,15 +135,15 @@ impl Bus {
     /// # Errors
     /// [`BusError::Zenoh`] when the session is closed.
     pub fn subscribe(&self, topic: Topic, inbox: &Arc<Inbox>) -> Result<Subscription, BusError> {
-        Subscription::to_key(&self.session, &topic.in_run(&self.identity.run), (inbox, None), &self.notices)
+        Subscription::to_key(&self.session, &topic.in_run(&self.identity.run), (inbox, None), &self.status)
     }
 
-    /// [`Self::subscribe`] with another number of places than the inbox's other topics have.
+    /// [`Self::subscribe`] with another queue length than that of the inbox.
     ///
     /// # Errors
     /// [`BusError::Zenoh`] when the session is closed.
     pub fn subscribe_keeping(&self, topic: Topic, places: usize, inbox: &Arc<Inbox>) -> Result<Subscription, BusError> {
-        Subscription::to_key(&self.session, &topic.in_run(&self.identity.run), (inbox, Some(places)), &self.notices)
+        Subscription::to_key(&self.session, &topic.in_run(&self.identity.run), (inbox, Some(places)), &self.status)
     }
 
     /// Delivers every topic of `selector` into `inbox`.
@@ -151,23 +151,24 @@ impl Bus {
     /// # Errors
     /// [`BusError::Zenoh`] when the session is closed.
     pub fn subscribe_all(&self, selector: &KeyExpr, inbox: &Arc<Inbox>) -> Result<Subscription, BusError> {
-        Subscription::to_all(&self.session, selector, inbox, &self.notices)
+        Subscription::to_all(&self.session, selector, inbox, &self.status)
     }
 
-    /// Listens in on `selectors` without a line in the books; of each key `places` messages may wait.
+    /// Subscribes passively to `selectors`, outside the message accounting; at most `places` messages of each key are
+    /// queued.
     ///
     /// # Errors
     /// [`BusError::Zenoh`] when the session is closed.
     pub fn tap(&self, selectors: &[KeyExpr], places: usize) -> Result<PassiveSubscriber, BusError> {
-        PassiveSubscriber::open(&self.session, selectors, places, &self.notices)
+        PassiveSubscriber::open(&self.session, selectors, places, &self.status)
     }
 
-    /// Says `control` to all who listen, without waiting.
+    /// Publishes `control` without waiting.
     pub fn say(&self, control: Control, capture_nanos: u64) {
-        self.notices.say(control, capture_nanos);
+        self.status.publish(control, capture_nanos);
     }
 
-    /// Shows this process, in its role, to those who watch.
+    /// Declares the liveliness token of this process in its role.
     ///
     /// # Errors
     /// [`BusError::Zenoh`] when the session is closed.
@@ -175,7 +176,8 @@ impl Bus {
         LivelinessToken::announce(&self.session, &self.identity.run, role, &self.identity.cav)
     }
 
-    /// Watches the processes of a role come and go, those already there first. `report` must not wait or call zenoh.
+    /// Subscribes to the liveliness of the processes of a role, present ones first. `report` must not wait or call
+    /// zenoh.
     ///
     /// # Errors
     /// [`BusError::Zenoh`] when the session is closed.
@@ -193,19 +195,19 @@ impl Bus {
         topic.in_run(&self.identity.run)
     }
 
-    /// Says how the books stand at the end, and closes the session, in at most `limit`. Publishers and subscriptions
-    /// are to be ended before.
+    /// Publishes the final ledger and closes the session, in at most `limit`. Publishers and subscriptions have to be
+    /// ended before.
     ///
     /// # Errors
-    /// [`Overdue`] when the network does not let go; the end of the process will.
+    /// [`Overdue`] when the session does not close in time; the end of the process closes it.
     pub fn leave(self, limit: Duration) -> Result<(), Overdue> {
-        let Self { session, identity, notices, speaking, .. } = self;
-        notices.close();
+        let Self { session, identity, status, status_thread, .. } = self;
+        status.close();
         shutdown::within(limit, "the zenoh session", move || {
-            if speaking.join().is_err() {
-                tracing::error!("the thread for notices panicked");
+            if status_thread.join().is_err() {
+                tracing::error!("the status thread panicked");
             }
-            // A connection that is closed throws away what still lies in its buffers.
+            // A connection that is closed discards the messages in its buffers.
             FlushBarrier::new(&session, &identity.run, Priority::Background).wait(limit);
             if let Err(cause) = session.close().wait() {
                 tracing::warn!("closing the zenoh session: {cause}");
@@ -214,7 +216,8 @@ impl Bus {
     }
 }
 
-/// A number that no other start of a process has: the standard library seeds its hashers from the system's randomness.
+/// A random number that differs for every process instance: the standard library seeds its hashers from the system's
+/// randomness.
 fn new_epoch() -> u64 {
     RandomState::new().hash_one(unix_nanos())
 }

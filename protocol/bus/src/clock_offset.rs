@@ -1,30 +1,30 @@
-//! How far the clock of a sender is from ours, from when it says it sent and when it came.
+//! Clock offset of a sender, estimated from publish and arrival times.
 
 use std::time::{Duration, Instant};
 
-/// The fastest message of so long a time counts, and of the time before it.
+/// The fastest message of this period and of the period before it gives the estimate.
 const WINDOW: Duration = Duration::from_secs(10);
-/// Clocks further ahead than this are worth a word, seconds.
+/// Offset ahead beyond which a warning is logged, seconds.
 const AHEAD_S: f64 = 0.05;
-/// Clocks further behind than this: what is under way for long looks the same.
+/// Offset behind beyond which a warning is logged, seconds; a long transit time has the same effect.
 const BEHIND_S: f64 = 2.0;
 
-/// The clock of one sender.
+/// Clock offset of one sender.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct ClockOffset {
     begun: Instant,
-    /// Shortest time from sending to arrival by the two clocks, nanoseconds: in this window and in the one before.
+    /// Shortest difference of arrival and publish time, nanoseconds: in this period and in the previous one.
     shortest: [i64; 2],
     was_far: bool,
 }
 
 impl ClockOffset {
-    /// After the first message.
+    /// Estimate after the first message.
     pub(super) fn new(now: Instant) -> Self {
         Self { begun: now, shortest: [i64::MAX; 2], was_far: false }
     }
 
-    /// Takes note of a message; whether the clock is far off where that is news.
+    /// Adds a message; returns whether the clock is far off if that has changed.
     pub(super) fn note(&mut self, sent_nanos: u64, arrived_nanos: u64, now: Instant) -> Option<bool> {
         if now.duration_since(self.begun) > WINDOW {
             self.begun = now;
@@ -35,12 +35,12 @@ impl ClockOffset {
         let offset_s = self.seconds();
         let half = if self.was_far { 0.5 } else { 1.0 };
         let is_far = offset_s > AHEAD_S * half || offset_s < -BEHIND_S * half;
-        let is_news = is_far != self.was_far;
+        let has_changed = is_far != self.was_far;
         self.was_far = is_far;
-        is_news.then_some(is_far)
+        has_changed.then_some(is_far)
     }
 
-    /// The sender's clock less ours, seconds, less the shortest time a message was under way.
+    /// The sender's clock minus ours, seconds, minus the shortest transit time.
     pub(super) fn seconds(&self) -> f64 {
         -(self.shortest[0].min(self.shortest[1]) as f64) * 1e-9
     }
@@ -51,20 +51,20 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_fastest_message_tells_and_a_step_of_the_clock_is_seen() {
+    fn the_fastest_message_gives_the_offset_and_a_clock_step_is_detected() {
         let begun = Instant::now();
         let mut clock = ClockOffset::new(begun);
-        let mut hear = |at_s: u64, ahead_ms: i64, under_way_ms: i64| {
+        let mut receive = |at_s: u64, ahead_ms: i64, under_way_ms: i64| {
             let now = 1_000_000_000_000_i64 + at_s as i64 * 1_000_000_000;
             let sent = now + (ahead_ms - under_way_ms) * 1_000_000;
-            let news = clock.note(sent as u64, now as u64, begun + Duration::from_secs(at_s));
-            (news, (clock.seconds() * 1e3).round() as i64)
+            let change = clock.note(sent as u64, now as u64, begun + Duration::from_secs(at_s));
+            (change, (clock.seconds() * 1e3).round() as i64)
         };
-        assert_eq!(hear(0, 0, 30), (None, -30));
-        assert_eq!(hear(1, 0, 2), (None, -2));
-        assert_eq!(hear(2, 500, 5), (Some(true), 495));
-        assert_eq!(hear(3, 500, 5), (None, 495));
-        assert_eq!(hear(14, 0, 5), (None, 495));
-        assert_eq!(hear(30, 0, 5), (Some(false), -5));
+        assert_eq!(receive(0, 0, 30), (None, -30));
+        assert_eq!(receive(1, 0, 2), (None, -2));
+        assert_eq!(receive(2, 500, 5), (Some(true), 495));
+        assert_eq!(receive(3, 500, 5), (None, 495));
+        assert_eq!(receive(14, 0, 5), (None, 495));
+        assert_eq!(receive(30, 0, 5), (Some(false), -5));
     }
 }

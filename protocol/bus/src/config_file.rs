@@ -1,4 +1,4 @@
-//! Configuration files: YAML of a bounded size into typed values, with errors that name file, line and field.
+//! Configuration files: YAML of a bounded size into typed values, with errors that state file, line and field.
 
 use std::fmt::{self, Display};
 use std::path::{Path, PathBuf};
@@ -6,10 +6,10 @@ use std::path::{Path, PathBuf};
 use protocol::config::FieldError;
 use serde::de::DeserializeOwned;
 
-/// Largest file that is read, bytes.
+/// Maximum size of a file, bytes.
 const MAX_BYTES: u64 = 1 << 20;
 
-/// Why a configuration file cannot be used.
+/// Error of a configuration file.
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
     /// The file cannot be read or written.
@@ -17,7 +17,7 @@ pub enum ConfigError {
     Io {
         /// The file.
         path: PathBuf,
-        /// Cause.
+        /// Error of the system.
         source: std::io::Error,
     },
     /// The file is not YAML, or a field is unknown, missing or of the wrong kind.
@@ -25,9 +25,9 @@ pub enum ConfigError {
     Syntax {
         /// The file.
         path: PathBuf,
-        /// Line of the offence, from 1.
+        /// Line of the error, from 1.
         line: Option<u64>,
-        /// The offence.
+        /// Description of the error.
         reason: String,
     },
     /// A field has a value that is not allowed. `path` is absent for values of the command line.
@@ -51,7 +51,7 @@ impl Display for Origin<'_> {
 /// Reads a YAML file of at most 1 MiB.
 ///
 /// # Errors
-/// [`ConfigError`] names the file, and the line where there is one.
+/// [`ConfigError`] states the file, and the line if there is one.
 pub fn read<T: DeserializeOwned>(path: &Path) -> Result<T, ConfigError> {
     let unreadable = |source| ConfigError::Io { path: path.into(), source };
     let size = std::fs::metadata(path).map_err(unreadable)?.len();
@@ -61,7 +61,7 @@ pub fn read<T: DeserializeOwned>(path: &Path) -> Result<T, ConfigError> {
     parse(&std::fs::read_to_string(path).map_err(unreadable)?, path)
 }
 
-/// Parses YAML; `path` is named in errors.
+/// Parses YAML; `path` is stated in errors.
 ///
 /// # Errors
 /// [`ConfigError::Syntax`].
@@ -80,12 +80,12 @@ mod tests {
     #[derive(Debug, serde::Deserialize)]
     #[serde(deny_unknown_fields)]
     struct Small {
-        #[expect(dead_code, reason = "only its name counts")]
+        #[expect(dead_code, reason = "only its name matters")]
         rate: f64,
     }
 
     #[test]
-    fn errors_name_file_line_and_field() {
+    fn errors_state_file_line_and_field() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.yaml");
         let missing = read::<Small>(&path).unwrap_err().to_string();

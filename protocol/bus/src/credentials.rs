@@ -1,4 +1,4 @@
-//! Keys and certificates: who a process is, in a form that its peers can check.
+//! Credentials: keys and certificates that authenticate a process to its peers.
 
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
@@ -10,22 +10,22 @@ use x509_parser::pem::parse_x509_pem;
 
 use super::BusError;
 
-/// The authority that everybody trusts.
+/// Certificate of the authority that all processes trust.
 pub const AUTHORITY_FILE: &str = "ca.pem";
-/// The certificate of this process.
+/// Certificate of this process.
 pub const CERTIFICATE_FILE: &str = "cert.pem";
-/// Its private key.
+/// Private key of this process.
 pub const KEY_FILE: &str = "key.pem";
-/// The router's list of those it lets in, one name a line.
+/// The router's list of admitted principals, one name per line.
 pub const MEMBERS_FILE: &str = "members";
-/// The name in a router's certificate.
+/// Common name of a router's certificate.
 pub const ROUTER: &str = "router";
 
-/// A certificate that ends sooner than this is worth a warning when a process starts.
+/// Remaining validity below which a warning is logged at the start of a process.
 const SOON: Duration = Duration::from_secs(3 * 24 * 3600);
 
-/// A folder with `ca.pem`, `cert.pem` and `key.pem`, looked through once: what is wrong with it is said here, in words,
-/// and not by a handshake that fails.
+/// A folder with `ca.pem`, `cert.pem` and `key.pem`, checked once: errors are reported here, with their cause, and not
+/// by a handshake that fails.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Credentials {
     folder: PathBuf,
@@ -36,7 +36,7 @@ impl Credentials {
     /// Reads the folder.
     ///
     /// # Errors
-    /// [`BusError::Keys`] names the file and what is wrong with it: missing, no certificate, expired.
+    /// [`BusError::Keys`] states the file and its error: missing, no certificate, expired.
     pub fn read(folder: &Path) -> Result<Self, BusError> {
         let folder = std::path::absolute(folder).map_err(|cause| bad(folder, &cause))?;
         for file in [AUTHORITY_FILE, KEY_FILE] {
@@ -57,10 +57,10 @@ impl Credentials {
         &self.name
     }
 
-    /// Whether this is the certificate of that process.
+    /// Checks that this is the certificate of that process.
     ///
     /// # Errors
-    /// [`BusError::Keys`] names both.
+    /// [`BusError::Keys`] states both names.
     pub fn check_name(&self, wanted: &str) -> Result<(), BusError> {
         if self.name == wanted {
             return Ok(());
@@ -69,15 +69,15 @@ impl Credentials {
         Err(bad(&certificate, &format!("this is the certificate of {}, and {wanted} needs its own", self.name)))
     }
 
-    /// Path of one of the files, as zenoh wants it.
+    /// Path of one of the files, as text for zenoh.
     pub(super) fn path(&self, file: &str) -> String {
         self.folder.join(file).to_string_lossy().into_owned()
     }
 
-    /// Those a router lets in.
+    /// Principals that a router admits.
     ///
     /// # Errors
-    /// [`BusError::Keys`] names the line that names nobody.
+    /// [`BusError::Keys`] states the line that names no principal.
     pub fn members(&self) -> Result<Vec<Principal>, BusError> {
         let path = self.folder.join(MEMBERS_FILE);
         let text = readable(&path)?;
@@ -94,13 +94,13 @@ fn readable(path: &Path) -> Result<String, BusError> {
     fs::read_to_string(path).map_err(|cause| bad(path, &cause))
 }
 
-/// Common name of a certificate that holds at this moment.
+/// Common name of a certificate that is valid at this time.
 fn name_of(path: &Path, now: SystemTime) -> Result<String, BusError> {
     let text = readable(path)?;
     let (_, pem) = parse_x509_pem(text.as_bytes()).map_err(|cause| bad(path, &cause))?;
     let certificate = pem.parse_x509().map_err(|cause| bad(path, &cause))?;
     let name = certificate.subject().iter_common_name().next().and_then(|name| name.as_str().ok());
-    let name = name.ok_or_else(|| bad(path, &"this certificate names nobody"))?.to_owned();
+    let name = name.ok_or_else(|| bad(path, &"this certificate has no common name"))?.to_owned();
     let validity = certificate.validity();
     let now = i64::try_from(now.duration_since(UNIX_EPOCH).unwrap_or_default().as_secs()).unwrap_or(i64::MAX);
     let (from, until) = (validity.not_before, validity.not_after);
@@ -121,23 +121,23 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_missing_or_no_certificate_is_named() {
+    fn errors_state_the_missing_or_invalid_file() {
         let folder = tempfile::tempdir().unwrap();
-        let says = |text: &str| {
+        let expect_error = |text: &str| {
             let error = Credentials::read(folder.path()).unwrap_err().to_string();
             assert!(error.contains(text), "{error}");
         };
-        says("ca.pem");
+        expect_error("ca.pem");
         fs::write(folder.path().join("ca.pem"), "").unwrap();
-        says("key.pem");
+        expect_error("key.pem");
         fs::write(folder.path().join("key.pem"), "").unwrap();
-        says("cert.pem");
+        expect_error("cert.pem");
         fs::write(folder.path().join("cert.pem"), "no certificate").unwrap();
-        says("cert.pem");
+        expect_error("cert.pem");
     }
 
     #[test]
-    fn members_are_parties() {
+    fn members_are_principals() {
         let folder = tempfile::tempdir().unwrap();
         let credentials = Credentials { folder: folder.path().into(), name: ROUTER.into() };
         assert!(credentials.members().unwrap_err().to_string().contains("members"));

@@ -1,4 +1,4 @@
-//! Where routers are.
+//! Endpoints of routers: `tcp/HOST:PORT` and `quic/HOST:PORT`.
 
 use std::fmt;
 
@@ -10,7 +10,7 @@ use super::BusError;
 const TCP: &str = "tcp/";
 const QUIC: &str = "quic/";
 
-/// A checked zenoh endpoint: `tcp/HOST:PORT`, or `quic/HOST:PORT` where both ends have keys.
+/// A checked zenoh endpoint: `tcp/HOST:PORT`, or `quic/HOST:PORT` if both ends have keys.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(try_from = "String", into = "String")]
 pub struct Endpoint(String);
@@ -30,10 +30,10 @@ impl From<Endpoint> for String {
 }
 
 impl Endpoint {
-    /// Reads `tcp/HOST:PORT` or `quic/HOST:PORT`; IPv6 hosts stand in brackets.
+    /// Parses `tcp/HOST:PORT` or `quic/HOST:PORT`; IPv6 hosts are in brackets.
     ///
     /// # Errors
-    /// [`BusError::Endpoint`] names what is not one.
+    /// [`BusError::Endpoint`] states the text that is not an endpoint.
     pub fn new(text: &str) -> Result<Self, BusError> {
         let bad = || BusError::Endpoint(text.chars().take(100).collect());
         let address = text.strip_prefix(TCP).or_else(|| text.strip_prefix(QUIC)).ok_or_else(bad)?;
@@ -52,32 +52,32 @@ impl Endpoint {
         Self(format!("tcp/127.0.0.1:{port}"))
     }
 
-    /// The same place, spoken to with keys. Who has them never falls back to plain TCP.
+    /// The same address over QUIC with keys. A process with keys never falls back to plain TCP.
     #[must_use]
     pub fn secured(&self) -> Self {
         Self(format!("{QUIC}{}", self.address()))
     }
 
-    /// Whether only those with keys speak there.
+    /// True if the endpoint requires keys.
     #[must_use]
     pub fn is_secured(&self) -> bool {
         self.0.starts_with(QUIC)
     }
 
-    /// The endpoint as it is written.
+    /// The endpoint as text.
     #[must_use]
     pub fn as_str(&self) -> &str {
         &self.0
     }
 
-    /// The same as zenoh is told. Over QUIC everything takes one stream and comes in the order in which it was sent, as
-    /// over TCP: were there one for each priority, a receipt would say nothing of what went with another.
+    /// The endpoint in zenoh's form. Over QUIC all messages use one stream and arrive in the order in which they were
+    /// sent, as over TCP: with a stream per priority a flush would not cover messages of other priorities.
     pub(super) fn for_zenoh(&self) -> String {
         if self.is_secured() { format!("{}?multistream=0", self.0) } else { self.0.clone() }
     }
 
     pub(super) fn address(&self) -> &str {
-        // Checked when it was made.
+        // Checked by the constructor.
         self.0.split_once('/').map_or("", |(_, address)| address)
     }
 }

@@ -1,4 +1,4 @@
-//! What goes wrong on the bus, in words that say what to do.
+//! Errors of the bus, each with its remedy.
 
 use std::path::PathBuf;
 
@@ -6,86 +6,86 @@ use serde_json::Value;
 
 use super::endpoint::Endpoint;
 
-/// Why the bus could not be opened or used.
+/// Error of opening or using the bus.
 #[derive(Debug, thiserror::Error)]
 pub enum BusError {
     /// Not an endpoint.
     #[error("{0:?} is not an endpoint: tcp/HOST:PORT, for example tcp/127.0.0.1:7447, or quic/HOST:PORT with keys")]
     Endpoint(String),
-    /// Keys that are not there, or not right.
+    /// Keys that are missing or invalid.
     #[error("{}: {what}", path.display())]
     Keys {
         /// The file or folder.
         path: PathBuf,
-        /// What is wrong with it.
+        /// Description of the error.
         what: String,
     },
-    /// An endpoint where only those with keys speak.
-    #[error("{0} takes keys: name their folder (--keys DIR; v2vloc keys makes them)")]
+    /// An endpoint that requires keys.
+    #[error("{0} requires keys: give their folder (--keys DIR; v2vloc keys creates them)")]
     NoKeys(Endpoint),
     /// zenoh refused or changed a setting.
     #[error("zenoh setting {key}: wanted {wanted}, {found}")]
     Setting {
         /// The key of the configuration.
         key: &'static str,
-        /// The value that was asked for.
+        /// The value requested.
         wanted: Value,
-        /// What zenoh made of it.
+        /// The value that zenoh has set.
         found: String,
     },
-    /// Another process listens there.
+    /// Another process uses the port.
     #[error("cannot listen at {endpoint}: the port is in use; end the other process or choose another port")]
     PortInUse {
-        /// Where.
+        /// Endpoint of the router.
         endpoint: Endpoint,
     },
-    /// Nothing answers at the router's place.
+    /// No router answers at the endpoint.
     #[error(
         "no router at {endpoint} after {waited_s:.1} s; start it first (v2vloc up, or zenohd) or correct the endpoint{}",
-        if endpoint.is_secured() { ". It may also have refused this certificate: its log says so" } else { "" }
+        if endpoint.is_secured() { ". It may also have rejected this certificate: see its log" } else { "" }
     )]
     Unreachable {
-        /// Where.
+        /// Endpoint of the router.
         endpoint: Endpoint,
         /// Seconds waited.
         waited_s: f64,
     },
-    /// The system gives no thread.
+    /// The system cannot start a thread.
     #[error("no thread for {what}: {cause}")]
     Thread {
-        /// What it was wanted for.
+        /// Purpose of the thread.
         what: String,
-        /// The system's words.
+        /// Error of the system.
         cause: std::io::Error,
     },
-    /// The metrics cannot be served there.
+    /// The metrics cannot be served at the address.
     #[error("cannot serve metrics at {address}: {cause}")]
     Metrics {
-        /// Where.
+        /// Address of the metrics.
         address: std::net::SocketAddr,
-        /// The system's words.
+        /// Error of the system.
         cause: std::io::Error,
     },
-    /// Anything else that zenoh says.
+    /// Any other error of zenoh.
     #[error("zenoh, {doing}: {cause}")]
     Zenoh {
-        /// What was tried.
+        /// Operation that failed.
         doing: String,
-        /// zenoh's words.
+        /// Error text of zenoh.
         cause: String,
     },
 }
 
 impl BusError {
-    /// Whether a failure goes back to an endpoint or to keys that cannot be used: for exit codes, so that a supervisor does
-    /// not start again what will fail again.
+    /// True if the cause of a failure is an endpoint or keys that cannot be used: for exit codes, so that a supervisor
+    /// does not restart a process that will fail again.
     #[must_use]
     pub fn is_behind(failure: &(dyn std::error::Error + 'static)) -> bool {
         let mut chain = std::iter::successors(Some(failure), |cause| cause.source());
         chain.any(|cause| cause.downcast_ref::<Self>().is_some_and(Self::is_bad_input))
     }
 
-    /// Whether what was asked for is at fault, so that trying again changes nothing.
+    /// True if the input is at fault, so that a retry has no effect.
     #[must_use]
     pub fn is_bad_input(&self) -> bool {
         matches!(self, Self::Endpoint(_) | Self::Keys { .. } | Self::NoKeys(_))

@@ -1,4 +1,4 @@
-//! Whether what was sent has left this machine.
+//! Flush barrier: waits until all published messages have reached the router.
 
 use std::time::{Duration, Instant};
 
@@ -6,51 +6,51 @@ use protocol::{KeyExpr, RunId};
 use zenoh::qos::{CongestionControl, Priority};
 use zenoh::{Session, Wait};
 
-/// How long one question waits. zenoh keeps a timer for each until then, answered or not: with many questions a second
-/// that is memory.
+/// Timeout of one query. zenoh keeps a timer for each until then, answered or not: many queries per second would use
+/// memory.
 const ROUND: Duration = Duration::from_secs(2);
 
-/// Tells when the router has everything that was put before.
+/// Reports when the router has received everything published before.
 pub(super) struct FlushBarrier {
     session: Session,
-    asked: KeyExpr,
+    key: KeyExpr,
     priority: Priority,
 }
 
 impl FlushBarrier {
-    /// Of what is sent with `priority` and before all that has a lower one.
+    /// A barrier for messages of `priority` and of all higher ones.
     pub(super) fn new(session: &Session, run: &RunId, priority: Priority) -> Self {
-        Self { session: session.clone(), asked: KeyExpr::none(run), priority }
+        Self { session: session.clone(), key: KeyExpr::none(run), priority }
     }
 
-    /// Waits for it, in at most `limit`. A question that nobody answers comes back from the router at once, and has to go
-    /// through the same queue as the messages before it. A connection that is lost ends the waiting too.
+    /// Waits for at most `limit`. A query without an answerer is returned by the router at once, and it passes through
+    /// the same queue as the messages before it. A lost connection ends the wait too.
     pub(super) fn wait(&self, limit: Duration) {
         let begun = Instant::now();
         while begun.elapsed() < limit && !self.answered() {}
         if begun.elapsed() >= limit {
-            tracing::warn!(?limit, "the router has not said that it has everything: what was sent last may be lost");
+            tracing::warn!(?limit, "the router has not confirmed the flush: the last messages may be lost");
         }
     }
 
-    /// Asks once; whether the waiting is over.
+    /// Sends one query; true if the wait is over.
     fn answered(&self) -> bool {
-        let asked = (self.session.get(self.asked.as_str()))
+        let query = (self.session.get(self.key.as_str()))
             .priority(self.priority)
             .congestion_control(CongestionControl::Block)
             .timeout(ROUND)
             .wait();
-        match asked {
+        match query {
             Ok(answers) => {
                 let mut is_over = true;
                 while let Ok(answer) = answers.recv() {
-                    // Nobody answers, so this is zenoh saying that the time is over.
+                    // No process answers, so an error is the timeout of zenoh.
                     is_over &= answer.result().is_ok();
                 }
                 is_over
             }
             Err(cause) => {
-                tracing::debug!("nobody to ask for a receipt: {cause}");
+                tracing::debug!("flush query failed: {cause}");
                 true
             }
         }

@@ -1,4 +1,4 @@
-//! Handshakes that fail, by what was wrong with them: zenoh says so in its log and nowhere else.
+//! Failed handshakes, counted by cause from zenoh's log, the only place that reports them.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -8,15 +8,15 @@ use tracing::field::{Field, Visit};
 use tracing::{Event, Subscriber};
 use tracing_subscriber::layer::{Context, Layer};
 
-/// Where zenoh takes in connections over QUIC, and what it says of those that come to nothing.
+/// Log target of zenoh's QUIC listener, and its text for failed connections.
 const ACCEPTOR: &str = "zenoh_link_commons::quic";
 const FAILED: &str = "QUIC acceptor failed";
 
-/// What rustls and quinn say, and what that means; the first that fits counts.
+/// Texts of rustls and quinn with their meaning; the first match counts.
 const CAUSES: [(&str, &str); 6] = [
     ("expired", "expired certificate"),
     ("UnknownIssuer", "certificate of another authority"),
-    // One that bears the same name.
+    // An authority with the same name.
     ("BadSignature", "certificate of another authority"),
     ("sent no certificates", "no certificate"),
     ("TimedOut", "begun and not finished"),
@@ -24,10 +24,10 @@ const CAUSES: [(&str, &str); 6] = [
 ];
 const OTHER: &str = "other";
 
-/// Since this process began, which has one router at most.
+/// Counts since this process began, which has one router at most.
 static COUNTS: Mutex<BTreeMap<&'static str, u64>> = Mutex::new(BTreeMap::new());
 
-/// A listener to the log that counts them.
+/// Log layer that counts them.
 pub(super) struct HandshakeCounter;
 
 impl<S: Subscriber> Layer<S> for HandshakeCounter {
@@ -35,15 +35,15 @@ impl<S: Subscriber> Layer<S> for HandshakeCounter {
         if !event.metadata().target().starts_with(ACCEPTOR) {
             return;
         }
-        let mut said = Said(String::new());
-        event.record(&mut said);
-        if said.0.contains(FAILED) {
-            *counts().entry(cause(&said.0)).or_default() += 1;
+        let mut text = EventText(String::new());
+        event.record(&mut text);
+        if text.0.contains(FAILED) {
+            *counts().entry(cause(&text.0)).or_default() += 1;
         }
     }
 }
 
-/// How many failed so far, by cause.
+/// Number of failed handshakes so far, by cause.
 pub(super) fn failed() -> BTreeMap<&'static str, u64> {
     counts().clone()
 }
@@ -52,14 +52,14 @@ fn counts() -> MutexGuard<'static, BTreeMap<&'static str, u64>> {
     COUNTS.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-fn cause(said: &str) -> &'static str {
-    CAUSES.iter().find(|(words, _)| said.contains(words)).map_or(OTHER, |(_, cause)| cause)
+fn cause(text: &str) -> &'static str {
+    CAUSES.iter().find(|(pattern, _)| text.contains(pattern)).map_or(OTHER, |(_, cause)| cause)
 }
 
 /// The text of an event.
-struct Said(String);
+struct EventText(String);
 
-impl Visit for Said {
+impl Visit for EventText {
     fn record_debug(&mut self, field: &Field, value: &dyn fmt::Debug) {
         if field.name() == "message" {
             self.0 = format!("{value:?}");

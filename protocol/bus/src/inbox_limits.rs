@@ -1,6 +1,6 @@
-//! How much a peer may bring: so many messages and bytes a second on each topic, so many bytes that wait altogether.
+//! Rate limits of an inbox: messages and bytes per second on each topic, and bytes waiting in total.
 //!
-//! A topic names its sender, and the router sees to it that nobody else puts there, so a limit by topic is one by peer.
+//! A topic names its sender, and the router rejects other publishers of it, so a limit by topic is a limit by peer.
 
 use std::collections::BTreeMap;
 use std::sync::{Mutex, PoisonError};
@@ -8,38 +8,38 @@ use std::time::Instant;
 
 use protocol::Topic;
 
-/// Topics that are metered apart; those of more peers share one meter.
+/// Maximum number of topics with a meter of their own; further topics share one meter.
 const MAX_METERS: usize = 1024;
-/// Seconds of its rate that a peer that was silent may bring at once: what a network held back comes together.
+/// Burst after silence, seconds of the rate: messages held back by a network arrive together.
 const BURST_S: f64 = 2.0;
 
-/// What an inbox takes.
+/// Limits of an inbox.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct InboxLimits {
-    /// Messages of one topic, a second.
+    /// Messages per second of one topic.
     pub messages_per_s: f64,
-    /// Bytes of one topic, a second.
+    /// Bytes per second of one topic.
     pub bytes_per_s: f64,
     /// Bytes that may wait, of all topics together.
     pub waiting_bytes: usize,
 }
 
 impl InboxLimits {
-    /// For what comes from processes of one's own.
+    /// No limits: for messages of one's own processes.
     pub const NONE: Self =
         Self { messages_per_s: f64::INFINITY, bytes_per_s: f64::INFINITY, waiting_bytes: usize::MAX };
-    /// For what comes from other vehicles: ten times what a sender of 10 Hz has to say, in the largest maps there are.
+    /// Limits for messages of other vehicles: ten times the rate of a 10 Hz sender, with the largest feature maps.
     pub const PEERS: Self =
         Self { messages_per_s: 100.0, bytes_per_s: (256_u64 << 20) as f64, waiting_bytes: 512 << 20 };
 }
 
-/// The meters of an inbox, one for each topic.
+/// Token buckets of an inbox, one for each topic.
 pub(super) struct RateLimiter {
     limits: InboxLimits,
     meters: Mutex<BTreeMap<Option<Topic>, Meter>>,
 }
 
-/// What a topic may still bring at a moment.
+/// Remaining budget of a topic at a time.
 struct Meter {
     messages: f64,
     bytes: f64,
@@ -51,7 +51,7 @@ impl RateLimiter {
         Self { limits, meters: Mutex::default() }
     }
 
-    /// Whether a message of `bytes` bytes keeps within the rates, now that it has come.
+    /// True if a message of `bytes` bytes keeps within the rates.
     pub(super) fn admit(&self, topic: &Topic, bytes: usize, now: Instant) -> bool {
         let InboxLimits { messages_per_s, bytes_per_s, .. } = self.limits;
         if messages_per_s.is_infinite() && bytes_per_s.is_infinite() {
@@ -60,7 +60,7 @@ impl RateLimiter {
         let mut meters = self.meters.lock().unwrap_or_else(PoisonError::into_inner);
         let own = Some(topic.clone());
         let key = if meters.len() < MAX_METERS || meters.contains_key(&own) { own } else { None };
-        // A rate far below one message a second still lets one through now and then.
+        // A rate far below one message per second still admits one from time to time.
         let burst = (messages_per_s * BURST_S).max(1.0);
         let full = || Meter { messages: burst, bytes: bytes_per_s * BURST_S, at: now };
         let meter = meters.entry(key).or_insert_with(full);
@@ -68,7 +68,8 @@ impl RateLimiter {
         meter.messages = (meter.messages + passed * messages_per_s).min(burst);
         meter.bytes = (meter.bytes + passed * bytes_per_s).min(bytes_per_s * BURST_S);
         meter.at = now;
-        // One message may have more bytes than are left, or no large one could ever come; those after it wait.
+        // One message may have more bytes than the remaining budget, or no large message could ever pass; those after
+        // it wait.
         let fits = meter.messages >= 1.0 && meter.bytes > 0.0;
         if fits {
             meter.messages -= 1.0;
@@ -88,14 +89,14 @@ mod tests {
         RateLimiter::new(InboxLimits { messages_per_s, bytes_per_s, waiting_bytes: usize::MAX })
     }
 
-    /// How many of `count` messages get through that come in equal steps.
+    /// Number of `count` messages, arriving in equal steps, that are admitted.
     fn admitted(meters: &RateLimiter, topic: &str, count: u32, step: Duration, bytes: usize) -> usize {
         let (topic, began) = (topic.parse().unwrap(), Instant::now());
         (0..count).filter(|index| meters.admit(&topic, bytes, began + step * *index)).count()
     }
 
     #[test]
-    fn a_flood_is_cut_to_its_rate_and_the_others_do_not_notice() {
+    fn a_flood_is_limited_to_its_rate_and_others_are_not_affected() {
         let meters = meters(20.0, 1e9);
         let flood = admitted(&meters, "1/bev", 10_000, Duration::from_millis(1), 1 << 10);
         assert!((230..=241).contains(&flood), "10 s of 20 Hz and the first 2 s' worth: {flood}");
@@ -103,7 +104,7 @@ mod tests {
     }
 
     #[test]
-    fn bytes_count_too_and_a_large_message_is_paid_for_afterwards() {
+    fn a_large_message_is_charged_to_the_following_ones() {
         let meters = meters(1e6, 1e6);
         assert_eq!(admitted(&meters, "1/bev", 10, Duration::from_nanos(1), 3_000_000), 1);
         let paid = Instant::now() + Duration::from_secs(2);
@@ -111,13 +112,13 @@ mod tests {
     }
 
     #[test]
-    fn a_low_rate_lets_a_message_through_now_and_then() {
+    fn a_low_rate_admits_a_message_from_time_to_time() {
         let admitted = admitted(&meters(0.25, 1e9), "1/bev", 9, Duration::from_secs(1), 1);
         assert_eq!(admitted, 3, "at the beginning and every 4 s");
     }
 
     #[test]
-    fn invented_topics_share_a_meter() {
+    fn forged_topics_share_a_meter() {
         let meters = meters(1.0, 1e9);
         let now = Instant::now();
         let admitted = (0..5_000).filter(|id| meters.admit(&format!("{id}/bev").parse().unwrap(), 1, now)).count();

@@ -1,15 +1,15 @@
-//! The bus between the processes of a run: zenoh, with every default that loses data replaced by a rule of ours.
+//! Bus between the processes of a run, on zenoh, with every default that loses data replaced by an explicit rule.
 //!
-//! - One process routes on a fixed endpoint, the others connect to it; nothing is discovered ([`open`]).
-//! - No producer waits for the network and no callback of zenoh's waits for a consumer: between them lie bounded
-//!   mailboxes in which the newest wins ([`mailbox`], [`Publisher`], [`Inbox`]).
-//! - What is overwritten, refused or still under way is counted ([`MessageStats`]), and the books are published.
-//! - A scene starts when every route has carried something ([`Barrier`]).
-//! - With keys every process shows who it is, and the router lets it say only what is its to say ([`Credentials`],
-//!   [`AccessControl`]); what it refused is counted ([`RejectionLog`]).
-//! - Ending takes a bounded time, whatever the network does ([`shutdown`]).
+//! - One process routes on a fixed endpoint, the others connect to it; there is no discovery ([`open`]).
+//! - No producer waits for the network and no callback of zenoh waits for a consumer: between them are bounded queues
+//!   that keep the newest message ([`bounded_queue`], [`Publisher`], [`Inbox`]).
+//! - Overwritten, rejected and in-flight messages are counted ([`MessageStats`]), and the ledger is published.
+//! - A scene starts when every route has carried a message ([`Barrier`]).
+//! - With keys every process is authenticated, and the router restricts it to its own topics ([`Credentials`],
+//!   [`AccessControl`]); rejected messages are counted ([`RejectionLog`]).
+//! - Shutdown takes a bounded time, whatever the state of the network ([`shutdown`]).
 //!
-//! Nothing here is async: zenoh brings its own runtimes, and a `put` that waits for a slow network must not hold up an
+//! The crate is not async: zenoh has its own runtimes, and a `put` that waits for a slow network must not block an
 //! executor. Inside tokio it needs the multi-thread runtime.
 
 mod access_control;

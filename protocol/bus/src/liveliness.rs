@@ -1,4 +1,4 @@
-//! Who is there: liveliness tokens and those who watch for them.
+//! Liveliness tokens of processes, and subscriptions to them.
 
 use std::collections::BTreeSet;
 use std::time::Duration;
@@ -9,18 +9,18 @@ use zenoh::{Session, Wait};
 
 use super::{BusError, process_id};
 
-/// How long a router may take to say who is there.
-const LOOK_LIMIT: Duration = Duration::from_secs(3);
+/// Timeout of a liveliness query to the router.
+const QUERY_TIMEOUT: Duration = Duration::from_secs(3);
 
-/// This process is alive, for as long as the value is.
+/// Liveliness token: this process is alive until the value is dropped.
 ///
-/// A process that dies is missed as soon as its connection closes, which on one machine is at once; one that falls
-/// silent behind a cut cable only after zenoh's lease of 10 s. Faster than that is the age of its last message.
+/// The token of a process that dies is withdrawn as soon as its connection closes, at once on one machine; after a cut
+/// link only when zenoh's lease of 10 s expires. The age of the last message shows it earlier.
 #[must_use = "the token is withdrawn when this is dropped"]
 pub struct LivelinessToken(zenoh::liveliness::LivelinessToken);
 
 impl LivelinessToken {
-    /// Tells everyone that `cav`'s process of this role is there.
+    /// Declares the liveliness token of `cav`'s process of this role.
     ///
     /// # Errors
     /// [`BusError::Zenoh`] when the session is closed.
@@ -30,7 +30,7 @@ impl LivelinessToken {
         token.map(Self).map_err(|cause| BusError::zenoh(format!("announcing {key}"), &cause))
     }
 
-    /// Withdraws the token and waits until the session has taken note.
+    /// Withdraws the token and waits until the session has processed it.
     ///
     /// # Errors
     /// [`BusError::Zenoh`] when the session is closed.
@@ -39,13 +39,13 @@ impl LivelinessToken {
     }
 }
 
-/// Every process of a run that is there now.
+/// Every process of a run that is alive now.
 ///
 /// # Errors
 /// [`BusError::Zenoh`] when the session is closed.
 pub fn present(session: &Session, run: &RunId) -> Result<BTreeSet<ProcessId>, BusError> {
     let selector = KeyExpr::everyone_alive(run);
-    let tokens = session.liveliness().get(selector.as_str()).timeout(LOOK_LIMIT).wait();
+    let tokens = session.liveliness().get(selector.as_str()).timeout(QUERY_TIMEOUT).wait();
     let tokens = tokens.map_err(|cause| BusError::zenoh(format!("looking for {selector}"), &cause))?;
     let process = |reply: zenoh::query::Reply| match reply.result().ok()?.key_expr().as_str().parse() {
         Ok(Key { topic: Topic::Alive { role, cav }, .. }) => Some(process_id(role, &cav)),
@@ -54,33 +54,33 @@ pub fn present(session: &Session, run: &RunId) -> Result<BTreeSet<ProcessId>, Bu
     Ok(std::iter::from_fn(|| tokens.recv().ok()).filter_map(process).collect())
 }
 
-/// A process came or went.
+/// A process joined or left.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum LivelinessEvent {
-    /// It is there, perhaps since long before the watch began.
+    /// The process is alive, possibly since long before the subscription.
     Appeared {
-        /// What it does.
+        /// Role of the process.
         role: Role,
-        /// For which vehicle.
+        /// Vehicle of the process.
         cav: CavId,
     },
-    /// It is gone.
+    /// The process is gone.
     Vanished {
-        /// What it did.
+        /// Role of the process.
         role: Role,
-        /// For which vehicle.
+        /// Vehicle of the process.
         cav: CavId,
     },
 }
 
-/// A watch over tokens; ends when dropped.
-#[must_use = "the watch ends when this is dropped"]
+/// A subscription to tokens; ends when dropped.
+#[must_use = "the subscription ends when this is dropped"]
 pub struct LivelinessSubscription(
     #[expect(dead_code, reason = "held for its lifetime only")] zenoh::pubsub::Subscriber<()>,
 );
 
 impl LivelinessSubscription {
-    /// Calls `report` for every token that `selector` meets, those present already first.
+    /// Calls `report` for every token that matches `selector`, present ones first.
     ///
     /// `report` runs on zenoh's receive thread: it hands over and returns, and must not call zenoh.
     ///
@@ -91,15 +91,16 @@ impl LivelinessSubscription {
         selector: &KeyExpr,
         report: impl Fn(LivelinessEvent) + Send + Sync + 'static,
     ) -> Result<Self, BusError> {
-        let watch = session.liveliness().declare_subscriber(selector.as_str()).history(true).callback(move |sample| {
-            // A token that is no key of ours says nothing to us.
-            if let Ok(Key { topic: Topic::Alive { role, cav }, .. }) = sample.key_expr().as_str().parse() {
-                report(match sample.kind() {
-                    SampleKind::Put => LivelinessEvent::Appeared { role, cav },
-                    SampleKind::Delete => LivelinessEvent::Vanished { role, cav },
-                });
-            }
-        });
-        watch.wait().map(Self).map_err(|cause| BusError::zenoh(format!("watching {selector}"), &cause))
+        let subscriber =
+            session.liveliness().declare_subscriber(selector.as_str()).history(true).callback(move |sample| {
+                // Tokens outside this key grammar are ignored.
+                if let Ok(Key { topic: Topic::Alive { role, cav }, .. }) = sample.key_expr().as_str().parse() {
+                    report(match sample.kind() {
+                        SampleKind::Put => LivelinessEvent::Appeared { role, cav },
+                        SampleKind::Delete => LivelinessEvent::Vanished { role, cav },
+                    });
+                }
+            });
+        subscriber.wait().map(Self).map_err(|cause| BusError::zenoh(format!("watching {selector}"), &cause))
     }
 }

@@ -1,4 +1,4 @@
-//! Who of a role comes and goes, for a thread that asks when it has time.
+//! Membership: processes of a role that join and leave, for a thread that polls.
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -9,39 +9,39 @@ use super::bounded_queue::{BoundedQueue, Pop, PushOutcome};
 use super::liveliness::{LivelinessEvent, LivelinessSubscription};
 use super::{Bus, BusError};
 
-/// Sightings that wait to be asked for; of one vehicle only the last.
+/// Liveliness events that wait to be polled; only the last of each vehicle is kept.
 pub struct Membership {
-    sightings: Arc<BoundedQueue<CavId, bool>>,
+    events: Arc<BoundedQueue<CavId, bool>>,
     _watch: LivelinessSubscription,
 }
 
 impl Membership {
-    /// Watches the processes of a role, those already there first. Of more than `most` vehicles at once some are passed
-    /// over, and the log says so: a flood of tokens must not become a flood of anything else.
+    /// Subscribes to the processes of a role, present ones first. Of more than `most` vehicles at once some are
+    /// skipped, with a warning in the log: a flood of tokens must not cause a flood of work.
     ///
     /// # Errors
     /// [`BusError::Zenoh`] when the session is closed.
     pub fn begin(bus: &Bus, role: Role, most: usize) -> Result<Self, BusError> {
-        let sightings = Arc::new(BoundedQueue::new(1, most));
-        let watch = bus.watch(role, {
-            let sightings = Arc::clone(&sightings);
-            move |sighting| {
-                let (cav, is_there) = match sighting {
+        let events = Arc::new(BoundedQueue::new(1, most));
+        let subscription = bus.watch(role, {
+            let events = Arc::clone(&events);
+            move |event| {
+                let (cav, is_there) = match event {
                     LivelinessEvent::Appeared { cav, .. } => (cav, true),
                     LivelinessEvent::Vanished { cav, .. } => (cav, false),
                 };
-                if let PushOutcome::NoLane(_) = sightings.push(cav.clone(), is_there) {
-                    tracing::warn!(%cav, "more processes come and go than can be followed");
+                if let PushOutcome::NoLane(_) = events.push(cav.clone(), is_there) {
+                    tracing::warn!(%cav, "more processes join and leave than can be tracked");
                 }
             }
         })?;
-        Ok(Self { sightings, _watch: watch })
+        Ok(Self { events, _watch: subscription })
     }
 
-    /// Somebody who came (`true`) or went since the last time; none when there is nobody left to tell of.
+    /// The next vehicle that joined (`true`) or left since the last call; `None` if there is none.
     #[must_use]
     pub fn next(&self) -> Option<(CavId, bool)> {
-        match self.sightings.take(Some(Instant::now())) {
+        match self.events.take(Some(Instant::now())) {
             Pop::Item(cav, is_there) => Some((cav, is_there)),
             Pop::TimedOut | Pop::Closed => None,
         }

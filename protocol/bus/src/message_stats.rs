@@ -1,4 +1,4 @@
-//! The ledger of one process, shared by its threads, and how long its stages take.
+//! Message counters and stage durations of one process, shared by its threads.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::fmt;
@@ -11,14 +11,15 @@ use support::statistics::{quantile, sorted};
 
 use super::clock_offset::ClockOffset;
 
-/// Accounts of one process, as many as whoever receives a ledger takes.
+/// Maximum number of accounts of one process, equal to the limit of the ledger's receivers.
 const MAX_ACCOUNTS: usize = Limits::DEFAULT.max_entries;
-/// Vehicles whose clock and standing are remembered at most.
+/// Maximum number of vehicles whose clock offset and trust are kept.
 const MAX_PEERS: usize = 128;
 /// Timings kept per stage: at 10 Hz the last three minutes.
 const KEPT_TIMINGS: usize = 2048;
 
-/// The books of one process. Cloning shares them. What is not booked ([`Topic::is_booked`]) leaves no trace in them.
+/// Message counters of one process. Clones share them. Topics outside the accounting ([`Topic::is_booked`]) are not
+/// counted.
 #[derive(Clone)]
 pub struct MessageStats {
     process: ProcessId,
@@ -28,11 +29,11 @@ pub struct MessageStats {
 #[derive(Default)]
 struct State {
     ledger: Ledger,
-    // How many messages of an account have come as far as this process takes them: out of a sender's queue onto the
-    // network, or from the network into a receiver's. What lies between is in flight.
+    // Messages of an account that have passed this process's queue: out of a sender's queue onto the network, or from
+    // the network into a receiver's. The difference to the messages counted is in flight.
     passed: BTreeMap<Account, u64>,
-    // Unsound messages, of whatever kind of topic.
-    refused: BTreeMap<Topic, u64>,
+    // Malformed messages, of any kind of topic.
+    rejections: BTreeMap<Topic, u64>,
     stages: BTreeMap<String, Timings>,
     peers: BTreeMap<CavId, Peer>,
     is_full: bool,
@@ -44,31 +45,31 @@ struct Peer {
     trust: Option<f64>,
 }
 
-/// What a process makes of a vehicle that it hears.
+/// State of a vehicle at this process.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PeerSummary {
     /// The vehicle.
     pub cav: CavId,
-    /// Its clock less ours, seconds, less the shortest time a message of it was under way.
+    /// Its clock minus ours, seconds, minus the shortest transit time.
     pub clock_offset_s: Option<f64>,
-    /// How far it is believed, 0..1; only where somebody asks.
+    /// Trust score, 0..1; only with misbehaviour detection.
     pub trust: Option<f64>,
 }
 
-/// Upper ends of the histogram's buckets, seconds: from a checksum to a lost cause.
+/// Upper bounds of the histogram's buckets, seconds.
 const BUCKETS_S: [f64; 14] =
     [0.0001, 0.00025, 0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5];
 
-/// How long a stage took, over all frames so far.
+/// Durations of a stage, over all frames so far.
 #[derive(Debug, Clone, PartialEq)]
 pub struct StageHistogram {
-    /// Its name.
+    /// Name of the stage.
     pub stage: String,
-    /// Frames.
+    /// Number of frames.
     pub count: u64,
-    /// All of their times, seconds.
+    /// Sum of the durations, seconds.
     pub sum_s: f64,
-    /// Upper end in seconds and number of frames of every bucket; the last has none ([`f64::MAX`]).
+    /// Upper bound in seconds and number of frames of every bucket; the last is unbounded ([`f64::MAX`]).
     pub buckets: Vec<(f64, u64)>,
 }
 
@@ -82,80 +83,79 @@ struct Timings {
 }
 
 impl MessageStats {
-    /// Empty books of `process`.
+    /// Counters of `process`, all zero.
     #[must_use]
     pub fn new(process: ProcessId) -> Self {
         Self { process, state: Arc::default() }
     }
 
-    /// Whose books these are.
+    /// Process of these counters.
     #[must_use]
     pub fn process(&self) -> &ProcessId {
         &self.process
     }
 
-    /// This process offers one more message on `topic`.
+    /// Counts one more message submitted on `topic`.
     pub fn offered(&self, topic: &Topic) {
         self.note(topic, |state| state.ledger.sent(&Account::published(topic.clone())));
     }
 
-    /// The network has taken a message that was offered.
+    /// Counts a submitted message as taken by the network.
     pub fn delivered(&self, topic: &Topic) {
         self.note(topic, |state| state.pass(Account::published(topic.clone())));
     }
 
-    /// A message that was offered will not be sent.
+    /// Counts a submitted message as suppressed.
     pub fn withheld(&self, topic: &Topic, reason: DropReason) {
         self.note(topic, |state| state.ledger.dropped(&Account::published(topic.clone()), reason));
     }
 
-    /// A map that is offered was written so that it keeps within a limit.
+    /// Counts a submitted feature map as written to keep within a limit.
     pub fn adapted(&self, topic: &Topic, reason: RateReason) {
         self.note(topic, |state| state.ledger.adapted(&Account::published(topic.clone()), reason));
     }
 
-    /// This process listens to `topic` from now on.
+    /// Opens the account of a subscription to `topic`.
     pub fn subscribed(&self, topic: &Topic) {
         self.note(topic, |state| state.ledger.open(&self.here(topic)));
     }
 
-    /// The network has delivered a message, sound or not.
+    /// Counts a message as delivered by the network, valid or not.
     pub fn arrived(&self, topic: &Topic) {
         self.note(topic, |state| state.pass(self.here(topic)));
     }
 
-    /// A message that arrived was used.
+    /// Counts an arrived message as used.
     pub fn received(&self, topic: &Topic) {
         self.note(topic, |state| state.ledger.received(&self.here(topic)));
     }
 
-    /// A message that arrived was not used.
+    /// Counts an arrived message as not used.
     pub fn dropped(&self, topic: &Topic, reason: DropReason) {
         self.note(topic, |state| state.ledger.dropped(&self.here(topic), reason));
     }
 
-    /// A message that arrived is unsound: counted always, logged ever more rarely, as a hostile peer must not fill the
-    /// log.
+    /// Counts an arrived message as malformed; logged ever more rarely, as a hostile peer must not fill the log.
     pub fn rejected(&self, topic: &Topic, error: &WireError) {
-        self.refused(topic, error.drop_reason(), error);
+        self.count_rejected(topic, error.drop_reason(), error);
     }
 
-    /// A message that arrived is more than its topic may bring; counted and logged like an unsound one.
+    /// Counts an arrived message as above the rate limit of its topic; logged like a malformed one.
     pub(super) fn limited(&self, topic: &Topic, why: &'static str) {
-        self.refused(topic, DropReason::RateLimit, &why);
+        self.count_rejected(topic, DropReason::RateLimit, &why);
     }
 
-    /// The same of a notice: logged alone, as no sender counts what it says about itself.
+    /// Logs a notification above the rate limit; not counted, as no sender counts its own notifications.
     pub(super) fn limited_notice(&self, topic: &Topic, why: &'static str) {
         self.warn_once(topic, DropReason::RateLimit, &why);
     }
 
-    /// A sound message says what is not its sender's to say; counted and logged like an unsound one.
+    /// Counts a valid message whose content its sender may not publish; logged like a malformed one.
     pub(super) fn reject_invalid(&self, topic: &Topic, why: &'static str) {
-        self.refused(topic, DropReason::Identity, &why);
+        self.count_rejected(topic, DropReason::Identity, &why);
     }
 
-    fn refused(&self, topic: &Topic, reason: DropReason, why: &dyn fmt::Display) {
+    fn count_rejected(&self, topic: &Topic, reason: DropReason, why: &dyn fmt::Display) {
         self.dropped(topic, reason);
         self.warn_once(topic, reason, why);
     }
@@ -163,37 +163,37 @@ impl MessageStats {
     fn warn_once(&self, topic: &Topic, reason: DropReason, why: &dyn fmt::Display) {
         let times = {
             let mut state = self.lock();
-            let has_room = state.refused.len() < MAX_ACCOUNTS || state.refused.contains_key(topic);
-            let times = state.refused.entry(if has_room { topic.clone() } else { Topic::Truth }).or_default();
+            let has_room = state.rejections.len() < MAX_ACCOUNTS || state.rejections.contains_key(topic);
+            let times = state.rejections.entry(if has_room { topic.clone() } else { Topic::Truth }).or_default();
             *times += 1;
             *times
         };
         if times.is_power_of_two() {
-            tracing::warn!(%topic, %reason, times, "message refused: {why}");
+            tracing::warn!(%topic, %reason, times, "message rejected: {why}");
         }
     }
 
-    /// A message of `cav` came: what that says of its clock. Said in the log when it is far off, and when it is not any more.
-    pub(super) fn heard_clock(&self, cav: &CavId, sent_nanos: u64, arrived_nanos: u64, at: Instant) {
-        let news = self.lock().peer(cav).and_then(|peer| {
+    /// Updates the clock offset of `cav` from a message. Logged when it gets large, and when it is small again.
+    pub(super) fn observe_clock(&self, cav: &CavId, sent_nanos: u64, arrived_nanos: u64, at: Instant) {
+        let change = self.lock().peer(cav).and_then(|peer| {
             let clock = peer.clock.get_or_insert_with(|| ClockOffset::new(at));
             Some((clock.note(sent_nanos, arrived_nanos, at)?, clock.seconds()))
         });
-        match news {
-            Some((true, offset_s)) => tracing::warn!(%cav, offset_s, "its clock is far from ours"),
-            Some((false, offset_s)) => tracing::info!(%cav, offset_s, "its clock is near ours again"),
+        match change {
+            Some((true, offset_s)) => tracing::warn!(%cav, offset_s, "clock offset of the vehicle is large"),
+            Some((false, offset_s)) => tracing::info!(%cav, offset_s, "clock offset of the vehicle is small again"),
             None => {}
         }
     }
 
-    /// How far a vehicle is believed from now on, 0..1.
+    /// Sets the trust score of a vehicle, 0..1.
     pub fn trusted(&self, cav: &CavId, trust: f64) {
         if let Some(peer) = self.lock().peer(cav) {
             peer.trust = Some(trust);
         }
     }
 
-    /// What is known of the vehicles that are heard.
+    /// State of the vehicles that have sent messages.
     #[must_use]
     pub fn peers(&self) -> Vec<PeerSummary> {
         let summary = |(cav, peer): (&CavId, &Peer)| PeerSummary {
@@ -204,7 +204,7 @@ impl MessageStats {
         self.lock().peers.iter().map(summary).collect()
     }
 
-    /// A stage took this long for one frame.
+    /// Records the duration of a stage for one frame.
     pub fn timed(&self, stage: &str, time: Duration) {
         let mut state = self.lock();
         if !state.stages.contains_key(stage) {
@@ -221,8 +221,7 @@ impl MessageStats {
         timings.last.push_back(time);
     }
 
-    /// The ledger as of now. What has been offered and not handed over, or has arrived and not been used or dropped,
-    /// is in flight.
+    /// Current ledger. Messages submitted and not handed over, or arrived and not yet used or dropped, are in flight.
     #[must_use]
     pub fn ledger(&self) -> Ledger {
         let state = self.lock();
@@ -238,14 +237,14 @@ impl MessageStats {
         ledger
     }
 
-    /// Every stage over its most recent frames.
+    /// Summary of every stage over its most recent frames.
     #[must_use]
     pub fn stages(&self) -> Vec<StageSummary> {
         let state = self.lock();
         state.stages.iter().map(|(stage, timings)| timings.summary(stage)).collect()
     }
 
-    /// Every stage over all its frames.
+    /// Histogram of every stage over all its frames.
     #[must_use]
     pub fn histograms(&self) -> Vec<StageHistogram> {
         let state = self.lock();
@@ -262,16 +261,16 @@ impl MessageStats {
     fn note(&self, topic: &Topic, change: impl FnOnce(&mut State)) {
         if topic.is_booked() {
             let mut state = self.lock();
-            // Invented ids must not fill the memory, nor make a ledger that nobody takes.
-            if state.ledger.len() < MAX_ACCOUNTS || self.knows(&state, topic) {
+            // Forged ids must not fill the memory, nor make a ledger that exceeds the limit of its receivers.
+            if state.ledger.len() < MAX_ACCOUNTS || self.has_account(&state, topic) {
                 change(&mut state);
             } else if !std::mem::replace(&mut state.is_full, true) {
-                tracing::error!(%topic, "the ledger has {MAX_ACCOUNTS} accounts: what comes on further topics is not counted");
+                tracing::error!(%topic, "the ledger has {MAX_ACCOUNTS} accounts: messages on further topics are not counted");
             }
         }
     }
 
-    fn knows(&self, state: &State, topic: &Topic) -> bool {
+    fn has_account(&self, state: &State, topic: &Topic) -> bool {
         [self.here(topic), Account::published(topic.clone())].iter().any(|account| state.ledger.get(account).is_some())
     }
 
@@ -279,7 +278,7 @@ impl MessageStats {
         Account::towards(topic.clone(), &self.process)
     }
 
-    // Counters are changed in one step each: a panic elsewhere leaves them sound.
+    // Counters are changed in one step each: a panic elsewhere leaves them consistent.
     fn lock(&self) -> MutexGuard<'_, State> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -322,13 +321,13 @@ mod tests {
         "4279/bev".parse().unwrap()
     }
 
-    fn books(process: &str) -> MessageStats {
+    fn stats_of(process: &str) -> MessageStats {
         MessageStats::new(process.parse().unwrap())
     }
 
     #[test]
-    fn what_lies_between_is_in_flight() {
-        let (agent, ego) = (books("agent-4279"), books("ego-4279"));
+    fn messages_in_queues_are_in_flight() {
+        let (agent, ego) = (stats_of("agent-4279"), stats_of("ego-4279"));
         ego.subscribed(&topic());
         for _ in 0..5 {
             agent.offered(&topic());
@@ -349,8 +348,8 @@ mod tests {
     }
 
     #[test]
-    fn what_is_said_again_and_again_is_not_booked() {
-        let agent = books("agent-4279");
+    fn repeated_messages_are_not_counted() {
+        let agent = stats_of("agent-4279");
         let topic: Topic = "4279/descriptor".parse().unwrap();
         agent.offered(&topic);
         agent.delivered(&topic);
@@ -359,29 +358,29 @@ mod tests {
     }
 
     #[test]
-    fn invented_ids_do_not_fill_the_books() {
-        let books = books("ego-1");
+    fn forged_ids_do_not_fill_the_ledger() {
+        let stats = stats_of("ego-1");
         let topic = |id: usize| format!("{id}/bev").parse::<Topic>().unwrap();
         for id in 0..3 * MAX_ACCOUNTS {
-            books.subscribed(&topic(id));
-            books.arrived(&topic(id));
-            books.limited(&topic(id), "too much");
+            stats.subscribed(&topic(id));
+            stats.arrived(&topic(id));
+            stats.limited(&topic(id), "too much");
         }
-        assert_eq!(books.ledger().len(), MAX_ACCOUNTS);
-        books.received(&topic(0));
-        let account = Account::towards(topic(0), books.process());
-        assert_eq!(books.ledger().get(&account).unwrap().received, 1, "those that are there go on");
-        let state = books.lock();
-        assert!(state.refused.len() <= MAX_ACCOUNTS + 1 && state.passed.len() <= MAX_ACCOUNTS);
+        assert_eq!(stats.ledger().len(), MAX_ACCOUNTS);
+        stats.received(&topic(0));
+        let account = Account::towards(topic(0), stats.process());
+        assert_eq!(stats.ledger().get(&account).unwrap().received, 1, "existing accounts continue");
+        let state = stats.lock();
+        assert!(state.rejections.len() <= MAX_ACCOUNTS + 1 && state.passed.len() <= MAX_ACCOUNTS);
     }
 
     #[test]
     fn stages_are_summed_up() {
-        let books = books("ego");
+        let stats = stats_of("ego");
         for ms in 1..=100 {
-            books.timed("fuse", Duration::from_millis(ms));
+            stats.timed("fuse", Duration::from_millis(ms));
         }
-        let stage = &books.stages()[0];
+        let stage = &stats.stages()[0];
         assert_eq!((stage.stage.as_str(), stage.count), ("fuse", 100));
         assert_eq!((stage.p50_ms, stage.p95_ms, stage.p99_ms, stage.max_ms), (50.5, 95.05, 99.01, 100.0));
     }

@@ -1,4 +1,4 @@
-//! The books of a process for Prometheus.
+//! Metrics endpoint: message counters and stage durations for Prometheus.
 
 use std::borrow::Cow;
 use std::fmt;
@@ -14,24 +14,24 @@ use prometheus_client::registry::{Registry, Unit};
 use super::MessageStats;
 use crate::web::{Answer, WebServer};
 
-/// Serves the books of a process at `http://<address>/metrics` until dropped.
+/// Serves the counters of a process at `http://<address>/metrics` until dropped.
 pub struct MetricsServer(WebServer);
 
 impl MetricsServer {
-    /// Begins to serve `books`; port 0 takes any free one.
+    /// Starts to serve `stats`; port 0: any free port.
     ///
     /// # Errors
-    /// When the address cannot be listened at.
-    pub fn start(address: SocketAddr, books: &MessageStats) -> std::io::Result<Self> {
-        let books = books.clone();
+    /// When the address cannot be bound.
+    pub fn start(address: SocketAddr, stats: &MessageStats) -> std::io::Result<Self> {
+        let stats = stats.clone();
         let server = WebServer::start(address, move |request| match request.path.as_str() {
-            "/metrics" => Answer::Page { content_type: CONTENT_TYPE, body: exposition(&books).into() },
-            other => Answer::NotFound(format!("{other} is not here, but /metrics is")),
+            "/metrics" => Answer::Page { content_type: CONTENT_TYPE, body: exposition(&stats).into() },
+            other => Answer::NotFound(format!("{other} not found; see /metrics")),
         })?;
         Ok(Self(server))
     }
 
-    /// Where it listens.
+    /// Address of the server.
     #[must_use]
     pub fn address(&self) -> SocketAddr {
         self.0.address()
@@ -40,27 +40,27 @@ impl MetricsServer {
 
 const CONTENT_TYPE: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
 
-/// The books in the OpenMetrics text format.
+/// The counters in the OpenMetrics text format.
 #[must_use]
-pub fn exposition(books: &MessageStats) -> String {
-    let process = (Cow::from("process"), Cow::from(books.process().to_string()));
+pub fn exposition(stats: &MessageStats) -> String {
+    let process = (Cow::from("process"), Cow::from(stats.process().to_string()));
     let mut registry = Registry::with_prefix_and_labels("v2vloc", [process].into_iter());
-    registry.register_collector(Box::new(BooksCollector(books.clone())));
+    registry.register_collector(Box::new(StatsCollector(stats.clone())));
     let mut text = String::new();
     // Writing to a string cannot fail.
     let _ = text::encode(&mut text, &registry);
     text
 }
 
-struct BooksCollector(MessageStats);
+struct StatsCollector(MessageStats);
 
-impl fmt::Debug for BooksCollector {
+impl fmt::Debug for StatsCollector {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "books of {}", self.0.process())
+        write!(f, "message counters of {}", self.0.process())
     }
 }
 
-impl Collector for BooksCollector {
+impl Collector for StatsCollector {
     fn encode(&self, mut encoder: DescriptorEncoder) -> fmt::Result {
         let ledger = self.0.ledger();
         let topics: Vec<(String, _)> = ledger
@@ -86,7 +86,7 @@ impl Collector for BooksCollector {
             }
         }
         let mut in_flight =
-            encoder.encode_descriptor("messages_in_flight", "Messages under way", None, MetricType::Gauge)?;
+            encoder.encode_descriptor("messages_in_flight", "Messages in flight", None, MetricType::Gauge)?;
         for (topic, (is_received, counts)) in &topics {
             let side = if *is_received { "receiver" } else { "sender" };
             let count = i64::try_from(counts.in_flight).unwrap_or(i64::MAX);
@@ -97,25 +97,21 @@ impl Collector for BooksCollector {
         let peers = self.0.peers();
         let mut clocks = encoder.encode_descriptor(
             "clock_offset",
-            "Clock of a vehicle less ours, less the shortest time a message was under way",
+            "Clock of a vehicle minus ours, minus the shortest transit time",
             Some(&seconds),
             MetricType::Gauge,
         )?;
         for (cav, offset_s) in peers.iter().filter_map(|peer| Some((&peer.cav, peer.clock_offset_s?))) {
             ConstGauge::new(offset_s).encode(clocks.encode_family(&[("vehicle", cav.as_str())])?)?;
         }
-        let mut trust = encoder.encode_descriptor(
-            "trust",
-            "How far the ego believes a vehicle, 0 to 1",
-            None,
-            MetricType::Gauge,
-        )?;
+        let mut trust =
+            encoder.encode_descriptor("trust", "Trust score of a vehicle, 0 to 1", None, MetricType::Gauge)?;
         for (cav, value) in peers.iter().filter_map(|peer| Some((&peer.cav, peer.trust?))) {
             ConstGauge::new(value).encode(trust.encode_family(&[("vehicle", cav.as_str())])?)?;
         }
         let mut stages = encoder.encode_descriptor(
             "stage",
-            "Time a stage takes for one frame",
+            "Duration of a stage for one frame",
             Some(&seconds),
             MetricType::Histogram,
         )?;
@@ -136,28 +132,28 @@ mod tests {
 
     use super::*;
 
-    fn books() -> MessageStats {
-        let books = MessageStats::new(ProcessId::new("agent-4279").unwrap());
+    fn sample() -> MessageStats {
+        let stats = MessageStats::new(ProcessId::new("agent-4279").unwrap());
         let cav = CavId::new("4279").unwrap();
         let [lidar, bev] = [Stream::Lidar, Stream::Bev].map(|stream| Topic::Stream { cav: cav.clone(), stream });
-        books.subscribed(&lidar);
+        stats.subscribed(&lidar);
         for _ in 0..5 {
-            books.arrived(&lidar);
+            stats.arrived(&lidar);
         }
-        books.received(&lidar);
-        books.received(&lidar);
-        books.dropped(&lidar, DropReason::Superseded);
-        books.offered(&bev);
-        books.trusted(&cav, 0.25);
+        stats.received(&lidar);
+        stats.received(&lidar);
+        stats.dropped(&lidar, DropReason::Superseded);
+        stats.offered(&bev);
+        stats.trusted(&cav, 0.25);
         for milliseconds in [0.2, 3.0, 4.0, 40.0, 9_000.0] {
-            books.timed("encode \"x\"", Duration::from_secs_f64(milliseconds / 1e3));
+            stats.timed("encode \"x\"", Duration::from_secs_f64(milliseconds / 1e3));
         }
-        books
+        stats
     }
 
     #[test]
-    fn counters_and_histograms_are_those_of_the_books() {
-        let text = exposition(&books());
+    fn counters_and_histograms_match() {
+        let text = exposition(&sample());
         let process = "process=\"agent-4279\"";
         for line in [
             format!("v2vloc_messages_sent_total{{{process},topic=\"4279/bev\"}} 1"),
@@ -183,11 +179,11 @@ mod tests {
     }
 
     #[test]
-    fn they_can_be_fetched() {
-        let server = MetricsServer::start("127.0.0.1:0".parse().unwrap(), &books()).unwrap();
+    fn metrics_can_be_fetched() {
+        let server = MetricsServer::start("127.0.0.1:0".parse().unwrap(), &sample()).unwrap();
         let (status, body) = crate::web::fetch(server.address(), "/metrics").unwrap();
         assert_eq!(status, "HTTP/1.0 200 OK");
-        assert_eq!(String::from_utf8(body).unwrap(), exposition(&books()));
+        assert_eq!(String::from_utf8(body).unwrap(), exposition(&sample()));
         assert!(crate::web::fetch(server.address(), "/").unwrap().0.contains("404"));
     }
 }

@@ -1,7 +1,7 @@
-//! Listening in on a whole run without a part in it: for recorders and viewers.
+//! Passive subscriber: captures all messages of a run for recorders and viewers.
 //!
-//! What a tap hears is in nobody's books, so that it may come late, leave early and overwrite what it has no time for
-//! without a message seeming lost; it keeps its own count of that.
+//! Captured messages are outside the message accounting, so that a passive subscriber may join late, leave early and
+//! overwrite messages without loss in the ledgers; it counts overwritten messages itself.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
@@ -14,130 +14,130 @@ use zenoh::sample::Sample;
 
 use super::bounded_queue::{BoundedQueue, Pop, PushOutcome};
 use super::status_publisher::StatusPublisher;
-use super::subscriber::has_notices;
+use super::subscriber::has_notifications;
 use super::{BusError, unix_nanos};
 
-/// Topics that a tap keeps apart at most: more than a run of 65 vehicles has.
+/// Maximum number of topics with a queue of their own: more than a run of 65 vehicles has.
 const MAX_TOPICS: usize = 1024;
-/// Bytes that may wait in a tap, whatever their keys: a disk that stands still must not take the memory of the run.
+/// Maximum bytes waiting, over all keys: a stalled disk must not use up the memory of the run.
 const MAX_WAITING: usize = 512 << 20;
 
-/// A message as it came by, unchecked but for its key.
+/// A captured message, unchecked except for its key.
 #[derive(Debug)]
 pub struct RawMessage {
     /// Its key.
     pub key: Key,
-    /// When it came, nanoseconds on the Unix clock.
+    /// Arrival time, nanoseconds on the Unix clock.
     pub arrived_nanos: u64,
     payload: ZBytes,
 }
 
 impl RawMessage {
-    /// The bytes, in the pieces they came in.
+    /// The bytes, in the pieces in which they arrived.
     #[must_use]
     pub fn pieces(&self) -> Vec<&[u8]> {
         self.payload.slices().collect()
     }
 
-    /// The bytes in one piece; copies them where they came in several.
+    /// The bytes in one piece; copied if they arrived in several.
     #[must_use]
     pub fn bytes(&self) -> std::borrow::Cow<'_, [u8]> {
         self.payload.to_bytes()
     }
 
-    /// How many bytes there are.
+    /// Number of bytes.
     #[must_use]
     pub fn len(&self) -> usize {
         self.payload.len()
     }
 
-    /// Whether there are none.
+    /// True if there are no bytes.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.payload.is_empty()
     }
 }
 
-/// Everything on the keys of some selectors, in bounded lanes, one per key, in which the newest wins.
+/// All messages on the keys of some selectors, in bounded queues, one per key, that keep the newest.
 pub struct PassiveSubscriber {
     shared: Arc<Shared>,
     _subscribers: Vec<zenoh::pubsub::Subscriber<()>>,
 }
 
 struct Shared {
-    mailbox: BoundedQueue<Topic, RawMessage>,
+    queue: BoundedQueue<Topic, RawMessage>,
     waiting_bytes: AtomicUsize,
     overwritten: AtomicU64,
 }
 
 impl PassiveSubscriber {
-    /// Listens to `selectors`; of each key `places` messages may wait. With `notices` probes are answered, so that a
-    /// barrier can wait for the tap.
+    /// Subscribes to `selectors`; at most `places` messages of each key are queued. With `status` probes are answered,
+    /// so that a barrier can wait for this subscriber.
     pub(super) fn open(
         session: &zenoh::Session,
         selectors: &[KeyExpr],
         places: usize,
-        notices: &StatusPublisher,
+        status: &StatusPublisher,
     ) -> Result<Self, BusError> {
         let shared = Arc::new(Shared {
-            mailbox: BoundedQueue::new(places, MAX_TOPICS),
+            queue: BoundedQueue::new(places, MAX_TOPICS),
             waiting_bytes: AtomicUsize::new(0),
             overwritten: AtomicU64::new(0),
         });
         let subscribe = |selector: &KeyExpr| {
-            let (shared, notices) = (Arc::clone(&shared), notices.clone());
+            let (shared, status) = (Arc::clone(&shared), status.clone());
             let subscriber = session.declare_subscriber(selector.as_str());
-            let subscriber = subscriber.callback(move |sample| shared.admit(&sample, &notices)).wait();
-            subscriber.map_err(|cause| BusError::zenoh(format!("listening to {}", selector.as_str()), &cause))
+            let subscriber = subscriber.callback(move |sample| shared.admit(&sample, &status)).wait();
+            subscriber.map_err(|cause| BusError::zenoh(format!("subscribing to {}", selector.as_str()), &cause))
         };
         let subscribers = selectors.iter().map(subscribe).collect::<Result<_, _>>()?;
         Ok(Self { shared, _subscribers: subscribers })
     }
 
-    /// The message that has waited longest, waiting until `deadline` for one.
+    /// The oldest message, waiting until `deadline` for one.
     pub fn take(&self, deadline: Option<Instant>) -> Pop<Topic, RawMessage> {
-        let taken = self.shared.mailbox.take(deadline);
-        if let Pop::Item(_, overheard) = &taken {
-            self.shared.waiting_bytes.fetch_sub(overheard.len(), Ordering::Relaxed);
+        let taken = self.shared.queue.take(deadline);
+        if let Pop::Item(_, raw_message) = &taken {
+            self.shared.waiting_bytes.fetch_sub(raw_message.len(), Ordering::Relaxed);
         }
         taken
     }
 
-    /// Messages that newer ones of the same key have taken the place of, or for which there was no room.
+    /// Number of messages that were replaced by newer ones of the same key, or for which there was no room.
     #[must_use]
     pub fn overwritten(&self) -> u64 {
         self.shared.overwritten.load(Ordering::Relaxed)
     }
 
-    /// A function that makes the tap take no more; what is inside can still be taken.
+    /// A function that stops capturing; queued messages can still be taken.
     pub fn closer(&self) -> impl FnOnce() + Send + 'static {
         let shared = Arc::clone(&self.shared);
-        move || shared.mailbox.close()
+        move || shared.queue.close()
     }
 }
 
 impl Shared {
-    /// RunScope on zenoh's receive thread: looks at headers only and waits for nothing.
-    fn admit(&self, sample: &Sample, notices: &StatusPublisher) {
+    /// Runs on zenoh's receive thread: reads headers only and waits for nothing.
+    fn admit(&self, sample: &Sample, status: &StatusPublisher) {
         let Ok(key) = sample.key_expr().as_str().parse::<Key>() else { return };
-        if has_notices(&key.topic) && !is_json(&key.topic) {
+        if has_notifications(&key.topic) && !is_json(&key.topic) {
             match wire::decode_header(sample.payload().slices()) {
-                Ok(header) if header.kind == Kind::Control => return note(&key.topic, sample, notices),
-                Ok(_) => notices.heard(&key.topic),
-                // Not ours to judge: whoever the message is for counts it.
+                Ok(header) if header.kind == Kind::Control => return note(&key.topic, sample, status),
+                Ok(_) => status.confirm_route(&key.topic),
+                // Not counted here: the receiver of the message counts it.
                 Err(_) => {}
             }
         }
         self.keep(RawMessage { key, arrived_nanos: unix_nanos(), payload: sample.payload().clone() });
     }
 
-    fn keep(&self, overheard: RawMessage) {
-        let len = overheard.len();
+    fn keep(&self, raw_message: RawMessage) {
+        let len = raw_message.len();
         let waiting = self.waiting_bytes.fetch_add(len, Ordering::Relaxed);
         let lost = if waiting + len > MAX_WAITING {
             Some(len)
         } else {
-            match self.mailbox.push(overheard.key.topic.clone(), overheard) {
+            match self.queue.push(raw_message.key.topic.clone(), raw_message) {
                 PushOutcome::Queued => None,
                 PushOutcome::Replaced(lost) | PushOutcome::NoLane(lost) | PushOutcome::Closed(lost) => Some(lost.len()),
             }
@@ -149,10 +149,10 @@ impl Shared {
     }
 }
 
-/// Probes and ends are about the route, not of the run.
-fn note(topic: &Topic, sample: &Sample, notices: &StatusPublisher) {
+/// Probes and end notifications concern the route and are not recorded.
+fn note(topic: &Topic, sample: &Sample, status: &StatusPublisher) {
     if let Ok((_, Control::Probe)) = wire::decode(sample.payload().slices(), &Limits::DEFAULT) {
-        notices.probed(topic);
+        status.probed(topic);
     }
 }
 
@@ -164,32 +164,32 @@ fn is_json(topic: &Topic) -> bool {
 mod tests {
     use super::*;
 
-    fn tap(places: usize) -> PassiveSubscriber {
+    fn passive(places: usize) -> PassiveSubscriber {
         let shared = Shared {
-            mailbox: BoundedQueue::new(places, MAX_TOPICS),
+            queue: BoundedQueue::new(places, MAX_TOPICS),
             waiting_bytes: AtomicUsize::new(0),
             overwritten: AtomicU64::new(0),
         };
         PassiveSubscriber { shared: Arc::new(shared), _subscribers: Vec::new() }
     }
 
-    fn overheard(vehicle: usize, payload: &ZBytes) -> RawMessage {
+    fn raw_message(vehicle: usize, payload: &ZBytes) -> RawMessage {
         let key = format!("v2v/test/{vehicle}/lidar").parse().unwrap();
         RawMessage { key, arrived_nanos: 0, payload: payload.clone() }
     }
 
     #[test]
-    fn what_waits_is_bounded_in_number_and_in_bytes() {
-        let tap = tap(2);
+    fn the_queue_is_bounded_in_messages_and_bytes() {
+        let passive = passive(2);
         let payload = ZBytes::from(vec![0_u8; 64 << 20]);
-        (0..3).for_each(|_| tap.shared.keep(overheard(0, &payload)));
-        assert_eq!(tap.overwritten(), 1, "two places for a key");
-        (1..10).for_each(|vehicle| tap.shared.keep(overheard(vehicle, &payload)));
-        assert_eq!(tap.overwritten(), 1 + 3, "eight of them fill the tap");
+        (0..3).for_each(|_| passive.shared.keep(raw_message(0, &payload)));
+        assert_eq!(passive.overwritten(), 1, "two places for a key");
+        (1..10).for_each(|vehicle| passive.shared.keep(raw_message(vehicle, &payload)));
+        assert_eq!(passive.overwritten(), 1 + 3, "eight of them fill the queue");
         let at_once = Some(Instant::now());
-        assert_eq!((0..9).filter(|_| matches!(tap.take(at_once), Pop::Item(..))).count(), 8);
-        assert_eq!(tap.shared.waiting_bytes.load(Ordering::Relaxed), 0);
-        tap.shared.keep(overheard(9, &payload));
-        assert_eq!(tap.overwritten(), 4, "there is room again");
+        assert_eq!((0..9).filter(|_| matches!(passive.take(at_once), Pop::Item(..))).count(), 8);
+        assert_eq!(passive.shared.waiting_bytes.load(Ordering::Relaxed), 0);
+        passive.shared.keep(raw_message(9, &payload));
+        assert_eq!(passive.overwritten(), 4, "there is room again");
     }
 }

@@ -1,13 +1,14 @@
-//! Who speaks plain TCP where a router takes QUIC alone: without a word of ours it would meet a closed port.
+//! Plain-TCP clients of a QUIC-only router: closes their connections and counts them.
 
 use std::net::{Shutdown, TcpListener};
 
 use super::endpoint::Endpoint;
 
-/// Turned away in one go, so that a flood of them keeps nobody from his work; the system keeps no more waiting.
-const MOST_AT_ONCE: usize = 1024;
+/// Maximum number of connections closed in one call, so that a flood does not block the caller; the system's backlog is
+/// no larger.
+const MAX_PER_CALL: usize = 1024;
 
-/// Turns away everyone who comes over TCP to the port at which a router listens over UDP, and counts them.
+/// Closes every TCP connection to the port at which a router listens over UDP, and counts them.
 #[derive(Debug)]
 pub(super) struct PlainTcp {
     listener: TcpListener,
@@ -15,7 +16,7 @@ pub(super) struct PlainTcp {
 }
 
 impl PlainTcp {
-    /// Listens where `router` takes QUIC; nowhere where it takes TCP itself, or another program does.
+    /// Listens at the address of a QUIC `router`; `None` if the router itself or another program uses TCP there.
     pub(super) fn beside(router: &Endpoint) -> Option<Self> {
         if !router.is_secured() {
             return None;
@@ -25,18 +26,18 @@ impl PlainTcp {
         match listener {
             Ok(listener) => Some(Self { listener, turned_away: 0 }),
             Err(error) => {
-                tracing::info!("who comes to {router} over plain TCP is not counted: {error}");
+                tracing::info!("plain-TCP clients of {router} are not counted: {error}");
                 None
             }
         }
     }
 
-    /// Turns away those who wait, without reading a byte of theirs. How many it were so far.
+    /// Closes waiting connections without reading a byte. Returns their total number so far.
     pub(super) fn reject(&mut self) -> u64 {
-        for _ in 0..MOST_AT_ONCE {
-            // Whatever the error, the others can wait until the next time.
-            let Ok((stranger, _)) = self.listener.accept() else { break };
-            let _ = stranger.shutdown(Shutdown::Both);
+        for _ in 0..MAX_PER_CALL {
+            // Whatever the error, the other connections can wait until the next call.
+            let Ok((client, _)) = self.listener.accept() else { break };
+            let _ = client.shutdown(Shutdown::Both);
             self.turned_away += 1;
         }
         self.turned_away
@@ -51,16 +52,16 @@ mod tests {
     use super::*;
 
     #[test]
-    fn who_comes_over_tcp_is_turned_away_and_counted() {
+    fn tcp_clients_are_disconnected_and_counted() {
         let free = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
         let router = Endpoint::loopback(free.port());
         assert!(PlainTcp::beside(&router).is_none(), "it takes TCP itself");
-        let mut door = PlainTcp::beside(&router.secured()).unwrap();
-        assert_eq!(door.reject(), 0);
-        let mut strangers = [(); 3].map(|()| TcpStream::connect(free).unwrap());
-        assert_eq!(door.reject(), 3);
-        for stranger in &mut strangers {
-            assert_eq!(stranger.read(&mut [0; 1]).unwrap(), 0, "nothing is said");
+        let mut listener = PlainTcp::beside(&router.secured()).unwrap();
+        assert_eq!(listener.reject(), 0);
+        let mut clients = [(); 3].map(|()| TcpStream::connect(free).unwrap());
+        assert_eq!(listener.reject(), 3);
+        for client in &mut clients {
+            assert_eq!(client.read(&mut [0; 1]).unwrap(), 0, "nothing is sent");
         }
         assert!(PlainTcp::beside(&router.secured()).is_none(), "the port is taken");
     }

@@ -1,7 +1,8 @@
-//! Configuration of a process: a file (`--config FILE`), changed by the options of the command line that are given.
+//! Configuration of a process: a file (`--config FILE`), changed by the given options of the command line.
 //!
-//! One type serves file, command line and JSON schema: serde reads and writes it, clap makes an option of every field, and the
-//! comment of a field is help text and description. Defaults stand in `Default` alone; the help quotes them from there.
+//! One type defines file, command line and JSON schema: serde reads and writes it, clap makes an option of every field,
+//! and the doc comment of a field is help text and description. `Default` is the only source of defaults; the help
+//! quotes them.
 
 use std::path::PathBuf;
 
@@ -15,7 +16,8 @@ use super::config_file::{self, ConfigError};
 
 /// Configuration of one process.
 pub trait ProcessConfig: Args + Serialize + DeserializeOwned {
-    /// Fields that have no default: `run`, or `models.weights` in a section. The option of each bears the last part.
+    /// Fields without a default: `run`, or `models.weights` in a section. The option of each has the last part as its
+    /// name.
     const REQUIRED: &'static [&'static str];
 
     /// Checks the values of all fields.
@@ -25,10 +27,10 @@ pub trait ProcessConfig: Args + Serialize + DeserializeOwned {
     fn validate(&self) -> Result<(), FieldError>;
 }
 
-/// The configuration with the required fields given by `value_of` their option and defaults elsewhere.
+/// The configuration with the required fields from `value_of` their option and defaults elsewhere.
 ///
 /// # Errors
-/// A value that its field does not take.
+/// A value that its field does not accept.
 pub fn minimal<C: ProcessConfig>(value_of: impl Fn(&str) -> String) -> Result<C, serde_json::Error> {
     let mut root = Map::new();
     for field in C::REQUIRED {
@@ -57,7 +59,7 @@ impl<C: ProcessConfig> Configured<C> {
     /// The configuration, its values checked.
     ///
     /// # Errors
-    /// [`ConfigError::Value`] names file, field and value.
+    /// [`ConfigError::Value`] states file, field and value.
     pub fn validated(self) -> Result<C, ConfigError> {
         let Self { file, config } = self;
         config.validate().map_err(|error| ConfigError::Value { path: file, error })?;
@@ -88,7 +90,7 @@ impl<C: ProcessConfig> FromArgMatches for Configured<C> {
     }
 }
 
-/// The option as it was given. A path that is no text is set again, exactly, with all other options.
+/// The option as it was given. A path that is not valid text is set again, exactly, with all other options.
 fn text_of(matches: &ArgMatches, option: &str) -> String {
     let given = matches.get_raw(option).and_then(|mut values| values.next());
     given.map_or_else(String::new, |value| value.to_string_lossy().into_owned())
@@ -100,8 +102,8 @@ impl<C: ProcessConfig> Args for Configured<C> {
             .long("config")
             .value_name("FILE")
             .value_parser(clap::value_parser!(PathBuf))
-            .help("Configuration of this process, YAML; options that are given change what it holds");
-        // A word that is an id, a path and a name.
+            .help("Configuration of this process, YAML; given options override it");
+        // A word that is valid as an id, a path and a name.
         let defaults = minimal::<C>(|_| "x".into()).and_then(serde_json::to_value).unwrap_or_default();
         let required = C::REQUIRED.iter().map(|field| field.rsplit('.').next().unwrap_or(field));
         let required: Vec<&str> = required.collect();
@@ -164,13 +166,13 @@ mod tests {
         config: Configured<Config>,
     }
 
-    fn parsed(words: &[&str]) -> Result<Config, String> {
-        let cli = Cli::try_parse_from([&["program"], words].concat()).map_err(|error| error.to_string())?;
+    fn parsed(arguments: &[&str]) -> Result<Config, String> {
+        let cli = Cli::try_parse_from([&["program"], arguments].concat()).map_err(|error| error.to_string())?;
         cli.config.validated().map_err(|error| error.to_string())
     }
 
     #[test]
-    fn options_change_what_a_file_holds_and_nothing_else() {
+    fn options_override_fields_of_a_file_only() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("c.yaml");
         std::fs::write(&path, "name: a\nsection: {seconds: 4, goes_on: true}\n").unwrap();

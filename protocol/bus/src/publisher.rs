@@ -1,4 +1,4 @@
-//! Publishing without ever waiting for the network on the caller's thread.
+//! Publisher: publishes from a thread of its own, so that the caller never waits for the network.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -18,54 +18,55 @@ use super::{Arrival, BusError, MessageStats};
 use crate::batch_scheduling;
 use support::nanos;
 
-/// Between two probes of a publisher that has sent nothing yet.
+/// Interval between two probes of a publisher that has sent nothing yet.
 const PROBE_PERIOD: Duration = Duration::from_millis(50);
-/// Messages of fewer bytes wait for nobody: asking whether they have come costs about as much as they do.
+/// Size below which no confirmation is awaited, bytes: the confirmation of a small message costs about as much as the
+/// message.
 const SMALL_BYTES: usize = 16 << 10;
 
-/// What happens to a message offered while the network still takes an earlier one.
+/// Behaviour when the network still takes an earlier message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Overflow {
-    /// It waits in a queue of this many places; in a full one it takes the place of the oldest, which is counted as
-    /// superseded. For everything that is measured anew all the time.
+    /// Bounded queue of this length, KEEP_LAST: the newest message replaces the oldest, which is counted as superseded.
+    /// For data that are measured periodically.
     KeepNewest(usize),
-    /// It waits in a queue of this many places, and so does its producer when that is full. For what must not be lost,
-    /// and for paced runs.
+    /// Bounded queue of this length; the producer waits when it is full. For messages that must not be lost, and for
+    /// paced runs.
     Wait(usize),
 }
 
-/// How a topic is published.
+/// Options of a publisher.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct PublisherOptions {
-    /// What an overload does.
+    /// Behaviour on overload.
     pub overflow: Overflow,
-    /// Which queue of the transport it goes through; a large message does not hold up one of higher priority.
+    /// Priority in the transport; a large message does not delay one of higher priority.
     pub priority: Priority,
     /// Sends at once rather than after the batching timer.
     pub express: bool,
-    /// For people who look on: zenoh may throw a message away rather than wait for anyone, there are no probes and no end
-    /// markers, and [`Publisher::is_wanted`] tells whether somebody listens.
+    /// For viewers: zenoh may drop a message rather than wait, there are no probes and no end notifications, and
+    /// [`Publisher::is_wanted`] is true while there are subscribers.
     pub is_for_onlookers: bool,
 }
 
 impl PublisherOptions {
-    /// Poses: small, first of all.
+    /// Poses: small, highest priority.
     pub const POSE: Self = Self::new(Priority::InteractiveHigh, true);
-    /// Detections: small, before all bulk.
+    /// Detections: small, before all bulk data.
     pub const DETECTIONS: Self = Self::new(Priority::DataHigh, true);
-    /// Features, boxes and points on their way to an ego.
+    /// Features, boxes and points from an agent to an ego.
     pub const FEATURES: Self = Self::new(Priority::Data, false);
-    /// Sensor data on their way to an agent.
+    /// Sensor data to an agent.
     pub const SENSOR: Self = Self::new(Priority::DataLow, false);
 
-    /// What people look at, and nobody computes with.
+    /// Previews for people, not used in any computation.
     pub const PREVIEW: Self = Self { is_for_onlookers: true, ..Self::new(Priority::Background, false) };
 
     const fn new(priority: Priority, express: bool) -> Self {
         Self { overflow: Overflow::KeepNewest(1), priority, express, is_for_onlookers: false }
     }
 
-    /// The same, but the producer waits rather than that anything be dropped.
+    /// The same, but the producer waits and no message is dropped.
     #[must_use]
     pub const fn lossless(self, places: usize) -> Self {
         Self { overflow: Overflow::Wait(places), ..self }
@@ -79,21 +80,22 @@ struct Offer {
     encode: Encode,
 }
 
-/// One topic of this process. A thread of its own encodes and sends what is offered.
+/// Publisher of one topic of this process. A thread of its own encodes and sends submitted messages.
 ///
-/// `put` is called under `CongestionControl::Block`, so that zenoh never drops: with its default it loses, without an
-/// error, every message that takes longer than 50 ms. The price is that `put` waits for the network, for seconds on a
-/// slow one, which is why neither a clock nor a network thread nor an async task may call it.
+/// `put` is called with `CongestionControl::Block`, so that zenoh never drops: by default it loses, without an error,
+/// every message that takes longer than 50 ms. As a consequence `put` waits for the network, for seconds on a slow one,
+/// so neither a clock nor a network thread nor an async task may call it.
 ///
-/// Where the newest wins, the next large message is taken only when the router has the one before: `put` is content with
-/// a place in the buffers of zenoh and of the system, a megabyte of them, in which maps would grow old on a slow link.
+/// With [`Overflow::KeepNewest`] the next large message is taken only when the router has the previous one: `put`
+/// returns as soon as a message is in the buffers of zenoh and of the system, which hold a megabyte, and feature maps
+/// would become stale there on a slow link.
 pub struct Publisher {
     topic: Topic,
     overflow: Overflow,
     queue: Arc<BoundedQueue<(), Offer>>,
-    books: MessageStats,
-    /// Whether somebody listens, where that matters.
-    audience: Option<Arc<AtomicBool>>,
+    stats: MessageStats,
+    /// True while there are subscribers; only for droppable topics.
+    has_subscribers: Option<Arc<AtomicBool>>,
     thread: Option<JoinHandle<()>>,
 }
 
@@ -102,12 +104,12 @@ impl Publisher {
         session: &zenoh::Session,
         (key, cav): (&Key, &CavId),
         epoch: u64,
-        books: &MessageStats,
+        stats: &MessageStats,
         options: PublisherOptions,
     ) -> Result<Self, BusError> {
         let PublisherOptions { overflow, priority, express, is_for_onlookers } = options;
         let topic = key.topic.clone();
-        // JSON has readers outside this program, to whom a probe would be noise.
+        // JSON is read by programs outside this project, which do not expect probes.
         let is_json = matches!(&topic, Topic::Stream { stream, .. } if stream.kind().is_none());
         let encoding = if is_json { Encoding::APPLICATION_JSON } else { Encoding::APPLICATION_OCTET_STREAM };
         let congestion = if is_for_onlookers { CongestionControl::Drop } else { CongestionControl::Block };
@@ -122,17 +124,18 @@ impl Publisher {
         let places = match overflow {
             Overflow::KeepNewest(places) | Overflow::Wait(places) => places,
         };
-        let audience = is_for_onlookers.then(|| audience(&publisher)).transpose();
-        let audience = audience.map_err(|cause| BusError::zenoh(format!("asking who listens to {key}"), &cause))?;
+        let has_subscribers = is_for_onlookers.then(|| has_subscribers(&publisher)).transpose();
+        let has_subscribers =
+            has_subscribers.map_err(|cause| BusError::zenoh(format!("asking for subscribers of {key}"), &cause))?;
         let queue = Arc::new(BoundedQueue::new(places, 1));
         let sender = Sender {
             topic: topic.clone(),
             cav: cav.clone(),
             epoch,
             sequence: 0,
-            has_notices: !is_json && !is_for_onlookers,
+            has_notifications: !is_json && !is_for_onlookers,
             queue: Arc::clone(&queue),
-            books: books.clone(),
+            stats: stats.clone(),
             publisher,
             receipt: FlushBarrier::new(session, &key.run, priority),
             is_one_at_a_time: matches!(overflow, Overflow::KeepNewest(_)) && !is_for_onlookers,
@@ -141,27 +144,28 @@ impl Publisher {
             .name(format!("send {topic}"))
             .spawn(move || sender.run())
             .map_err(|cause| BusError::Thread { what: format!("sending {key}"), cause })?;
-        Ok(Self { topic, overflow, queue, books: books.clone(), audience, thread: Some(thread) })
+        Ok(Self { topic, overflow, queue, stats: stats.clone(), has_subscribers, thread: Some(thread) })
     }
 
-    /// Whether it is worth while to offer anything: always, but for what is for onlookers when there are none.
+    /// True if messages should be submitted: always, except for viewer topics without subscribers.
     #[must_use]
     pub fn is_wanted(&self) -> bool {
-        self.audience.as_ref().is_none_or(|audience| audience.load(Ordering::Relaxed))
+        self.has_subscribers.as_ref().is_none_or(|has_subscribers| has_subscribers.load(Ordering::Relaxed))
     }
 
-    /// What is published here.
+    /// Topic of the publisher.
     #[must_use]
     pub fn topic(&self) -> &Topic {
         &self.topic
     }
 
-    /// Offers a message measured at `capture_nanos`. Returns at once, except under [`Overflow::Wait`] with a full queue.
+    /// Submits a message captured at `capture_nanos`. Returns at once, except under [`Overflow::Wait`] with a full
+    /// queue.
     pub fn offer<M: Payload + Send + 'static>(&self, capture_nanos: u64, message: M) {
         self.offer_encoded(capture_nanos, move |stamp| wire::encode(stamp, message));
     }
 
-    /// Offers what `encode` makes of the stamp when it is the message's turn, on the sending thread.
+    /// Submits a message that `encode` makes from its stamp on the sending thread.
     pub fn offer_encoded(
         &self,
         capture_nanos: u64,
@@ -170,13 +174,13 @@ impl Publisher {
         self.push(Offer { capture_nanos, encode: Box::new(|stamp| encode(stamp).map(payload)) });
     }
 
-    /// Passes on a message as it came, under the stamp of its sender; nothing is copied.
+    /// Forwards a message unchanged, under the stamp of its sender; nothing is copied.
     pub fn relay(&self, arrival: &Arrival) {
         let bytes = arrival.payload().clone();
         self.push(Offer { capture_nanos: arrival.header.stamp.capture_nanos, encode: Box::new(|_| Ok(bytes)) });
     }
 
-    /// The same with another capture time: that of a clock which is off.
+    /// The same with another capture time, that of an erroneous clock.
     pub fn relay_as(&self, arrival: &Arrival, capture_nanos: u64) {
         if arrival.header.stamp.capture_nanos == capture_nanos {
             return self.relay(arrival);
@@ -192,7 +196,7 @@ impl Publisher {
     }
 
     fn push(&self, offer: Offer) {
-        self.books.offered(&self.topic);
+        self.stats.offered(&self.topic);
         let pushed = match self.overflow {
             Overflow::KeepNewest(_) => self.queue.push((), offer),
             Overflow::Wait(_) => self.queue.push_waiting((), offer),
@@ -200,12 +204,12 @@ impl Publisher {
         match pushed {
             PushOutcome::Queued => {}
             PushOutcome::Replaced(_) | PushOutcome::NoLane(_) | PushOutcome::Closed(_) => {
-                self.books.withheld(&self.topic, DropReason::Superseded);
+                self.stats.withheld(&self.topic, DropReason::Superseded);
             }
         }
     }
 
-    /// Sends what is still queued, then a notice of how many messages there were, and ends. Waits for the network.
+    /// Sends queued messages, then a notification with the number of messages, and ends. Waits for the network.
     pub fn finish(mut self) {
         self.queue.close();
         if let Some(thread) = self.thread.take()
@@ -217,42 +221,42 @@ impl Publisher {
 }
 
 impl Drop for Publisher {
-    /// Without [`Self::finish`] the thread sends what is left and ends by itself.
+    /// Without [`Self::finish`] the thread sends queued messages and ends by itself.
     fn drop(&mut self) {
         self.queue.close();
     }
 }
 
-/// The sending thread's side.
+/// State of the sending thread.
 struct Sender {
     topic: Topic,
     cav: CavId,
     epoch: u64,
     sequence: u64,
-    has_notices: bool,
+    has_notifications: bool,
     queue: Arc<BoundedQueue<(), Offer>>,
-    books: MessageStats,
+    stats: MessageStats,
     publisher: zenoh::pubsub::Publisher<'static>,
     receipt: FlushBarrier,
-    /// Whether the router must have a large message before the next one is taken from the queue.
+    /// True if the router must have a large message before the next one is taken from the queue.
     is_one_at_a_time: bool,
 }
 
 impl Sender {
     fn run(mut self) {
         batch_scheduling::use_batch_scheduling();
-        if self.has_notices {
+        if self.has_notifications {
             self.notify(Control::Probe);
         }
         loop {
-            let probing = self.has_notices && self.sequence == 0;
+            let probing = self.has_notifications && self.sequence == 0;
             match self.queue.take(probing.then(|| Instant::now() + PROBE_PERIOD)) {
                 Pop::Item((), offer) => self.send(offer),
                 Pop::TimedOut => self.notify(Control::Probe),
                 Pop::Closed => break,
             }
         }
-        if self.has_notices {
+        if self.has_notifications {
             let sent = vec![TopicCount { topic: self.topic.clone(), messages: self.sequence }];
             self.notify(Control::End { ticks: self.sequence, sent });
         }
@@ -262,40 +266,40 @@ impl Sender {
         let began = Instant::now();
         match encode(&self.stamp(capture_nanos)) {
             Ok(bytes) => {
-                self.books.timed("encode", began.elapsed());
+                self.stats.timed("encode", began.elapsed());
                 self.sequence += 1;
                 let is_large = bytes.len() >= SMALL_BYTES;
                 if self.put(bytes) {
-                    self.books.delivered(&self.topic);
+                    self.stats.delivered(&self.topic);
                     if is_large && self.is_one_at_a_time {
                         self.receipt.wait(LONGEST_MESSAGE);
                     }
                 } else {
-                    // The session is closed: nothing carries it.
-                    self.books.withheld(&self.topic, DropReason::PeerOffline);
+                    // The session is closed: there is no transport.
+                    self.stats.withheld(&self.topic, DropReason::PeerOffline);
                 }
             }
             Err(error) => {
                 tracing::error!(topic = %self.topic, capture_nanos, "message cannot be sent: {error}");
-                self.books.withheld(&self.topic, error.drop_reason());
+                self.stats.withheld(&self.topic, error.drop_reason());
             }
         }
     }
 
-    /// Markers on the data key keep their place among the data; they are not counted.
+    /// Notifications on the data key keep their order among the data; they are not counted.
     fn notify(&self, control: Control) {
         match wire::encode(&self.stamp(0), control) {
             Ok(encoded) => {
                 self.put(payload(encoded));
             }
-            Err(error) => tracing::error!(topic = %self.topic, "notice cannot be sent: {error}"),
+            Err(error) => tracing::error!(topic = %self.topic, "notification cannot be sent: {error}"),
         }
     }
 
     fn put(&self, bytes: ZBytes) -> bool {
         let sent = self.publisher.put(bytes).wait();
         if let Err(cause) = &sent {
-            tracing::error!(topic = %self.topic, "zenoh refuses a message: {cause}");
+            tracing::error!(topic = %self.topic, "zenoh rejected a message: {cause}");
         }
         sent.is_ok()
     }
@@ -311,19 +315,19 @@ impl Sender {
     }
 }
 
-/// Whether somebody listens, kept up to date for as long as the publisher lives.
-fn audience(publisher: &zenoh::pubsub::Publisher<'_>) -> zenoh::Result<Arc<AtomicBool>> {
-    let audience = Arc::<AtomicBool>::default();
-    let noted = Arc::clone(&audience);
+/// True while there are subscribers, updated for the lifetime of the publisher.
+fn has_subscribers(publisher: &zenoh::pubsub::Publisher<'_>) -> zenoh::Result<Arc<AtomicBool>> {
+    let has_subscribers = Arc::<AtomicBool>::default();
+    let noted = Arc::clone(&has_subscribers);
     let listener = publisher.matching_listener();
     listener.callback(move |status| noted.store(status.matching(), Ordering::Relaxed)).background().wait()?;
     if publisher.matching_status().wait()?.matching() {
-        audience.store(true, Ordering::Relaxed);
+        has_subscribers.store(true, Ordering::Relaxed);
     }
-    Ok(audience)
+    Ok(has_subscribers)
 }
 
-/// Head and body one after the other, without copying the body.
+/// Head and body concatenated, without copying the body.
 pub(super) fn payload(encoded: Encoded) -> ZBytes {
     let mut writer = ZBytes::writer();
     writer.append(encoded.head.into());
@@ -333,7 +337,7 @@ pub(super) fn payload(encoded: Encoded) -> ZBytes {
     writer.finish()
 }
 
-/// Now, on the Unix clock.
+/// Current time on the Unix clock, nanoseconds.
 #[must_use]
 pub fn unix_nanos() -> u64 {
     let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
@@ -348,17 +352,17 @@ mod tests {
     use crate::{BusOptions, Endpoint, open};
 
     #[test]
-    fn what_zenoh_refuses_is_no_longer_in_flight() {
+    fn messages_rejected_by_zenoh_are_not_in_flight() {
         let session = open(&BusOptions::router(Endpoint::loopback(0))).unwrap();
-        let (key, books): (Key, _) = ("v2v/test/7/gnss".parse().unwrap(), MessageStats::new("replay".parse().unwrap()));
+        let (key, stats): (Key, _) = ("v2v/test/7/gnss".parse().unwrap(), MessageStats::new("replay".parse().unwrap()));
         let cav = CavId::new("7").unwrap();
-        let publisher = Publisher::new(&session, (&key, &cav), 1, &books, PublisherOptions::POSE).unwrap();
+        let publisher = Publisher::new(&session, (&key, &cav), 1, &stats, PublisherOptions::POSE).unwrap();
         session.close().wait().unwrap();
         let source = GnssSource::Recorded;
         let gnss = Gnss { world_from_lidar: Pose::IDENTITY, position_std_m: 0.0, heading_std_rad: 0.0, source };
         publisher.offer(5, gnss);
         publisher.finish();
         let lost = Counts { sent: 1, dropped: [(DropReason::PeerOffline, 1)].into(), ..Counts::default() };
-        assert_eq!(books.ledger().get(&Account::published(key.topic)), Some(&lost));
+        assert_eq!(stats.ledger().get(&Account::published(key.topic)), Some(&lost));
     }
 }

@@ -1,9 +1,9 @@
-//! The barrier in front of a scene: no clock starts before every route has carried something.
+//! Start barrier of a scene: no clock starts before every route has carried a message.
 //!
-//! A message published before its route exists is lost without a word, and knowing that *some* subscriber matches does
-//! not tell which. So every publisher sends probes on its real key until its first real message, every subscriber
-//! answers each probe on `ready/<process>`, and the process that holds the clock waits until all the routes it expects
-//! have been heard of.
+//! A message published before its route exists is lost without an error, and a matching subscriber is not necessarily
+//! the expected one. So every publisher sends probes on its real key until its first real message, every subscriber
+//! answers each probe on `ready/<process>`, and the process that holds the clock waits until all expected routes are
+//! confirmed.
 
 use std::collections::BTreeSet;
 use std::fmt;
@@ -19,23 +19,23 @@ use serde::{Deserialize, Serialize};
 use super::bounded_queue::Pop;
 use super::{Bus, BusError, Event, Inbox, Subscription};
 
-/// Answers of one process that may wait: each repeats what the one before it said.
+/// Queued answers of one process: each repeats the content of the previous one.
 const PLACES: usize = 1;
-/// Processes whose answers may wait at once; a run of 64 vehicles has fewer.
+/// Maximum number of processes with queued answers; a run of 64 vehicles has fewer.
 const MAX_PROCESSES: usize = 256;
 
-/// How often a waiting barrier asks whether it should still wait.
-const ASK_AGAIN: Duration = Duration::from_millis(100);
-/// Routes that an error names; a fleet of many misses many at once.
-const NAMED: usize = 20;
+/// Interval at which a waiting barrier checks whether it should still wait.
+const POLL_PERIOD: Duration = Duration::from_millis(100);
+/// Maximum number of routes in an error text.
+const MAX_LISTED: usize = 20;
 
-/// From the publisher of a topic to one process that listens to it, written `4279/lidar>agent-4279`.
+/// From the publisher of a topic to one subscribing process, written `4279/lidar>agent-4279`.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, JsonSchema)]
 #[serde(try_from = "String", into = "String")]
 pub struct Route {
-    /// What is published.
+    /// Topic of the publisher.
     pub topic: Topic,
-    /// Who has to hear it.
+    /// Subscribing process.
     pub receiver: ProcessId,
 }
 
@@ -45,8 +45,8 @@ impl fmt::Display for Route {
     }
 }
 
-/// The name of a process in ledgers and routes: `agent-4279`, or the role alone where the vehicle is only a stand-in for
-/// it (`replay`).
+/// The name of a process in ledgers and routes: `agent-4279`, or the role if the vehicle is only a placeholder for it
+/// (`replay`).
 #[must_use]
 pub fn process_id(role: Role, cav: &CavId) -> ProcessId {
     Principal::new(role, cav).name()
@@ -87,19 +87,19 @@ impl From<Route> for String {
     }
 }
 
-/// Not every route came up.
+/// Some routes are not confirmed.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("after {:.1} s nothing has come through {}{}; is that process running, and in the same run?", .waited.as_secs_f64(),
-    .missing.iter().take(NAMED).map(ToString::to_string).collect::<Vec<_>>().join(", "),
-    if .missing.len() > NAMED { format!(" and {} more", .missing.len() - NAMED) } else { String::new() })]
+#[error("no message within {:.1} s on {}{}; is that process running, and in the same run?", .waited.as_secs_f64(),
+    .missing.iter().take(MAX_LISTED).map(ToString::to_string).collect::<Vec<_>>().join(", "),
+    if .missing.len() > MAX_LISTED { format!(" and {} more", .missing.len() - MAX_LISTED) } else { String::new() })]
 pub struct NotReady {
-    /// Routes nobody has answered on, in order.
+    /// Routes without an answer, in order.
     pub missing: Vec<Route>,
-    /// How long the barrier waited.
+    /// Waiting time.
     pub waited: Duration,
 }
 
-/// Routes that are still to be heard of.
+/// Routes that are not confirmed yet.
 #[derive(Default)]
 pub struct Barrier {
     missing: Mutex<BTreeSet<Route>>,
@@ -107,16 +107,16 @@ pub struct Barrier {
 }
 
 impl Barrier {
-    /// A barrier that opens when all of `expected` have been heard of; at once if there are none.
+    /// A barrier that opens when all of `expected` are confirmed; at once if there are none.
     #[must_use]
     pub fn new(expected: impl IntoIterator<Item = Route>) -> Self {
         Self { missing: Mutex::new(expected.into_iter().collect()), changed: Condvar::new() }
     }
 
-    /// Listens on `bus` for the answers to probes.
+    /// Subscribes on `bus` to the answers to probes.
     ///
     /// # Errors
-    /// [`BusError`] when the bus is closed or the system gives no thread.
+    /// [`BusError`] when the bus is closed or the system cannot start a thread.
     pub fn await_routes(self, bus: &Bus) -> Result<RoutesReady, BusError> {
         let (barrier, inbox) = (Arc::new(self), bus.inbox(PLACES, MAX_PROCESSES));
         let subscription = bus.subscribe_all(&KeyExpr::ready(&bus.identity().run), &inbox)?;
@@ -132,19 +132,19 @@ impl Barrier {
         while let Pop::Item(topic, event) = inbox.take(None) {
             let (Topic::Ready(sender), Event::Message(arrival)) = (&topic, event) else { continue };
             match inbox.decode(&arrival, &Limits::DEFAULT) {
-                // Nobody says for another what that one has heard.
+                // A process may confirm its own routes only.
                 Some(Control::Ready { process, heard }) if process == *sender => {
                     for topic in heard {
                         self.heard(&Route { topic, receiver: sender.clone() });
                     }
                 }
-                Some(_) => inbox.reject_invalid(&topic, "not the sender's own notice of readiness"),
+                Some(_) => inbox.reject_invalid(&topic, "not the sender's own readiness"),
                 None => {}
             }
         }
     }
 
-    /// Someone answered a probe on `route`. Routes that nobody expects change nothing.
+    /// Marks `route` as confirmed. Routes that are not expected change nothing.
     pub fn heard(&self, route: &Route) {
         if self.lock().remove(route) {
             self.changed.notify_all();
@@ -157,29 +157,29 @@ impl Barrier {
         self.lock().iter().cloned().collect()
     }
 
-    /// Waits until the barrier is open, at most for `patience`.
+    /// Waits until the barrier is open, at most for `timeout`.
     ///
     /// # Errors
-    /// [`NotReady`] names the routes that are missing.
-    pub fn wait(&self, patience: Duration) -> Result<(), NotReady> {
-        self.wait_unless(patience, || false)
+    /// [`NotReady`] lists the missing routes.
+    pub fn wait(&self, timeout: Duration) -> Result<(), NotReady> {
+        self.wait_unless(timeout, || false)
     }
 
-    /// [`Self::wait`] that gives up as soon as `given_up` says so.
+    /// [`Self::wait`] that gives up as soon as `given_up` returns true.
     ///
     /// # Errors
-    /// [`NotReady`] names the routes that are missing.
-    pub fn wait_unless(&self, patience: Duration, given_up: impl Fn() -> bool) -> Result<(), NotReady> {
+    /// [`NotReady`] lists the missing routes.
+    pub fn wait_unless(&self, timeout: Duration, given_up: impl Fn() -> bool) -> Result<(), NotReady> {
         let began = Instant::now();
         let mut missing = self.lock();
         while !missing.is_empty() {
-            let left = patience.saturating_sub(began.elapsed());
+            let left = timeout.saturating_sub(began.elapsed());
             if left.is_zero() || given_up() {
                 let waited = began.elapsed();
                 return Err(NotReady { missing: missing.iter().cloned().collect(), waited });
             }
-            let nap = left.min(ASK_AGAIN);
-            missing = self.changed.wait_timeout(missing, nap).unwrap_or_else(PoisonError::into_inner).0;
+            let pause = left.min(POLL_PERIOD);
+            missing = self.changed.wait_timeout(missing, pause).unwrap_or_else(PoisonError::into_inner).0;
         }
         Ok(())
     }
@@ -189,7 +189,7 @@ impl Barrier {
     }
 }
 
-/// A [`Barrier`] that hears the answers to probes, until it is dropped.
+/// A [`Barrier`] that receives the answers to probes, until it is dropped.
 pub struct RoutesReady {
     barrier: Arc<Barrier>,
     inbox: Arc<Inbox>,
@@ -223,9 +223,9 @@ mod tests {
         for text in ["4279/lidar>agent-4279", "truth>scorer", "rx/4279/4288/bev>ego-4279"] {
             assert_eq!(route(text).to_string(), text);
         }
-        for (text, says) in [("4279/lidar", "'>'"), ("4279/nothing>a", "key"), ("truth>A", "process name")] {
+        for (text, expected) in [("4279/lidar", "'>'"), ("4279/nothing>a", "key"), ("truth>A", "process name")] {
             let error = text.parse::<Route>().unwrap_err().to_string();
-            assert!(error.contains(says), "{error}");
+            assert!(error.contains(expected), "{error}");
         }
     }
 
@@ -237,7 +237,7 @@ mod tests {
     }
 
     #[test]
-    fn opens_when_all_have_been_heard() {
+    fn opens_when_all_routes_are_confirmed() {
         let barrier = Barrier::new([route("1/lidar>a"), route("2/lidar>b")]);
         barrier.heard(&route("1/lidar>a"));
         barrier.heard(&route("3/lidar>c"));
@@ -252,7 +252,7 @@ mod tests {
     }
 
     #[test]
-    fn an_error_does_not_name_a_thousand_routes() {
+    fn an_error_does_not_list_a_thousand_routes() {
         let barrier = Barrier::new((0..1000).map(|index| route(&format!("{index}/lidar>a"))));
         let text = barrier.wait(Duration::ZERO).unwrap_err().to_string();
         assert!(text.contains("and 980 more") && text.len() < 1000, "{text}");

@@ -1,37 +1,37 @@
-//! Whether a message is news: what came before, what is repeated, and who else speaks under the same name.
+//! Replay protection: rejects duplicate and stale sequence numbers and detects two senders with one id.
 //!
-//! A sender numbers its messages in rising order and draws an epoch when it starts. A new epoch is a sender that has
-//! started again, and is believed at once. When the one before it goes on speaking, two speak under one name; which of
-//! them is the right one cannot be told from here, so neither is heard until one of them has been silent for a while.
+//! A sender numbers its messages in increasing order and draws an epoch when it starts. A new epoch means a restarted
+//! sender and is accepted at once. If the previous epoch continues, two senders use one id; the receiver cannot tell
+//! which one is legitimate, so both are quarantined until one of them has been silent for a while.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::time::{Duration, Instant};
 
 use protocol::{DropReason, Topic};
 
-/// What a sender had under way when it was started again may come so long after the first word of its successor.
+/// Period after a restart in which messages of the previous instance may still arrive.
 const GRACE: Duration = Duration::from_secs(1);
-/// A sender that says nothing for so long is not there any more.
+/// Silence after which a sender is considered gone.
 const QUIET: Duration = Duration::from_secs(3);
-/// Epochs before the current one that are remembered per topic.
+/// Number of previous epochs kept per topic.
 const EPOCHS: usize = 8;
-/// New epochs within [`QUIET`] that a sender may have: who starts more often is several, or one that makes them up.
+/// New epochs that a sender may have within [`QUIET`]: more mean several senders, or forged epochs.
 const STARTS: usize = 4;
-/// Topics remembered at most: a hostile sender must not fill the memory.
+/// Maximum number of topics kept: a hostile sender must not fill the memory.
 const TOPICS: usize = 1024;
 
-/// What is known of the senders on all topics of an inbox.
+/// State of the senders on all topics of an inbox.
 #[derive(Debug, Default)]
 pub(super) struct ReplayWindow {
     topics: BTreeMap<Topic, Senders>,
 }
 
-/// Whether a message is news, and what to say of it.
+/// Result of the check of a message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Admission {
-    /// Why it is not; none where it is.
+    /// Drop reason; `None` if the message is accepted.
     pub(super) dropped: Option<DropReason>,
-    /// Whether the topic's senders are quarantined from now on, or not any more.
+    /// `true` if the topic's senders are quarantined from now on, `false` if the quarantine ends.
     pub(super) quarantine: Option<bool>,
 }
 
@@ -47,12 +47,12 @@ struct Senders {
 struct Sender {
     epoch: u64,
     numbers: SequenceWindow,
-    heard: Instant,
-    /// When another epoch took its place.
+    last_seen: Instant,
+    /// Time at which another epoch replaced this one.
     replaced: Instant,
 }
 
-/// SequenceWindow that came: the highest, and which of the 64 before it.
+/// Sequence numbers received: the highest, and a bit mask of the 64 before it.
 #[derive(Debug)]
 struct SequenceWindow {
     highest: u64,
@@ -60,13 +60,13 @@ struct SequenceWindow {
 }
 
 impl ReplayWindow {
-    /// Takes note of a message and says whether it is news.
+    /// Adds a message and decides whether it is accepted.
     pub(super) fn admit(&mut self, topic: &Topic, epoch: u64, sequence: u64, now: Instant) -> Admission {
         if let Some(senders) = self.topics.get_mut(topic) {
             return senders.admit(epoch, sequence, now);
         }
         if self.topics.len() >= TOPICS {
-            let oldest = self.topics.iter().min_by_key(|(_, senders)| senders.current.heard);
+            let oldest = self.topics.iter().min_by_key(|(_, senders)| senders.current.last_seen);
             if let Some(oldest) = oldest.map(|(topic, _)| topic.clone()) {
                 self.topics.remove(&oldest);
             }
@@ -92,14 +92,14 @@ impl Senders {
         if epoch == self.current.epoch {
             let repeated = self.current.numbers.note(sequence);
             if repeated.is_none() {
-                self.current.heard = now;
+                self.current.last_seen = now;
             }
             return repeated;
         }
         if let Some(place) = self.former.iter().position(|sender| sender.epoch == epoch) {
-            return self.heard_again(place, sequence, now);
+            return self.admit_previous_epoch(place, sequence, now);
         }
-        // Started again: believed at once.
+        // A restarted sender is accepted at once.
         while self.starts.front().is_some_and(|start| now.duration_since(*start) > QUIET) {
             self.starts.pop_front();
         }
@@ -112,14 +112,14 @@ impl Senders {
         None
     }
 
-    /// A sender of before speaks: a copy of its words, the last of them, or a second sender.
-    fn heard_again(&mut self, place: usize, sequence: u64, now: Instant) -> Option<DropReason> {
+    /// A message of a previous epoch: a replay, a message in transit at the restart, or a second sender.
+    fn admit_previous_epoch(&mut self, place: usize, sequence: u64, now: Instant) -> Option<DropReason> {
         let sender = &mut self.former[place];
         if let Some(repeated) = sender.numbers.note(sequence) {
             return Some(repeated);
         }
-        sender.heard = now;
-        if now.duration_since(self.current.heard) > QUIET {
+        sender.last_seen = now;
+        if now.duration_since(self.current.last_seen) > QUIET {
             // Its successor has gone.
             if let Some(sender) = self.former.remove(place) {
                 self.replace(sender, now);
@@ -146,12 +146,12 @@ impl Senders {
 
 impl Sender {
     fn new(epoch: u64, sequence: u64, now: Instant) -> Self {
-        Self { epoch, numbers: SequenceWindow { highest: sequence, came: 1 }, heard: now, replaced: now }
+        Self { epoch, numbers: SequenceWindow { highest: sequence, came: 1 }, last_seen: now, replaced: now }
     }
 }
 
 impl SequenceWindow {
-    /// Takes note of a number; why it is no news, where it is none. What was overtaken comes too late.
+    /// Adds a sequence number; returns the drop reason if it is rejected. Overtaken messages are stale.
     fn note(&mut self, sequence: u64) -> Option<DropReason> {
         if sequence > self.highest {
             let ahead = sequence - self.highest;
@@ -172,89 +172,89 @@ impl SequenceWindow {
 mod tests {
     use super::*;
 
-    struct Ear {
-        freshness: ReplayWindow,
+    struct Receiver {
+        replay_window: ReplayWindow,
         topic: Topic,
         begun: Instant,
     }
 
-    impl Ear {
+    impl Receiver {
         fn new() -> Self {
-            Self { freshness: ReplayWindow::default(), topic: "4279/bev".parse().unwrap(), begun: Instant::now() }
+            Self { replay_window: ReplayWindow::default(), topic: "4279/bev".parse().unwrap(), begun: Instant::now() }
         }
 
-        fn hear(&mut self, epoch: u64, sequence: u64, at_ms: u64) -> Admission {
-            self.freshness.admit(&self.topic, epoch, sequence, self.begun + Duration::from_millis(at_ms))
+        fn receive(&mut self, epoch: u64, sequence: u64, at_ms: u64) -> Admission {
+            self.replay_window.admit(&self.topic, epoch, sequence, self.begun + Duration::from_millis(at_ms))
         }
 
         fn dropped(&mut self, epoch: u64, sequence: u64, at_ms: u64) -> Option<DropReason> {
-            self.hear(epoch, sequence, at_ms).dropped
+            self.receive(epoch, sequence, at_ms).dropped
         }
     }
 
     #[test]
-    fn a_repeated_number_is_a_duplicate_and_one_that_was_overtaken_comes_too_late() {
-        let mut ear = Ear::new();
-        assert_eq!([10, 11, 14].map(|number| ear.dropped(1, number, 0)), [None; 3]);
-        assert_eq!(ear.dropped(1, 14, 0), Some(DropReason::Duplicate));
-        assert_eq!(ear.dropped(1, 12, 0), Some(DropReason::Superseded));
-        assert_eq!(ear.dropped(1, 12, 0), Some(DropReason::Duplicate));
-        assert_eq!(ear.dropped(1, 1_000_000, 0), None);
-        assert_eq!(ear.dropped(1, 15, 0), Some(DropReason::Duplicate), "too long ago to know");
+    fn a_repeated_number_is_a_duplicate_and_an_overtaken_one_is_stale() {
+        let mut receiver = Receiver::new();
+        assert_eq!([10, 11, 14].map(|number| receiver.dropped(1, number, 0)), [None; 3]);
+        assert_eq!(receiver.dropped(1, 14, 0), Some(DropReason::Duplicate));
+        assert_eq!(receiver.dropped(1, 12, 0), Some(DropReason::Superseded));
+        assert_eq!(receiver.dropped(1, 12, 0), Some(DropReason::Duplicate));
+        assert_eq!(receiver.dropped(1, 1_000_000, 0), None);
+        assert_eq!(receiver.dropped(1, 15, 0), Some(DropReason::Duplicate), "outside of the window");
     }
 
     #[test]
-    fn a_sender_that_starts_again_is_heard_at_once_and_its_old_words_are_not() {
-        let mut ear = Ear::new();
-        assert_eq!(ear.dropped(1, 100, 0), None);
-        let again = ear.hear(2, 0, 100);
+    fn a_restarted_sender_is_accepted_at_once_and_its_old_messages_are_not() {
+        let mut receiver = Receiver::new();
+        assert_eq!(receiver.dropped(1, 100, 0), None);
+        let again = receiver.receive(2, 0, 100);
         assert_eq!(again, Admission { dropped: None, quarantine: None });
-        // A replay of old words, and the last of them on their way.
-        assert_eq!(ear.dropped(1, 100, 5_000), Some(DropReason::Duplicate));
-        assert_eq!(ear.dropped(2, 1, 5_000), None);
-        assert_eq!(ear.dropped(3, 0, 6_000), None);
-        assert_eq!(ear.dropped(2, 2, 6_200), Some(DropReason::Superseded));
-        assert_eq!(ear.dropped(3, 1, 6_300), None);
+        // A replay of old messages, and the last of them in transit.
+        assert_eq!(receiver.dropped(1, 100, 5_000), Some(DropReason::Duplicate));
+        assert_eq!(receiver.dropped(2, 1, 5_000), None);
+        assert_eq!(receiver.dropped(3, 0, 6_000), None);
+        assert_eq!(receiver.dropped(2, 2, 6_200), Some(DropReason::Superseded));
+        assert_eq!(receiver.dropped(3, 1, 6_300), None);
     }
 
     #[test]
-    fn two_under_one_name_are_both_silenced_until_one_is_left() {
-        let mut ear = Ear::new();
-        let mut said = Vec::new();
+    fn two_senders_with_one_id_are_quarantined_until_one_is_left() {
+        let mut receiver = Receiver::new();
+        let mut changes = Vec::new();
         for step in 0..40_u64 {
-            ear.dropped(1, step, step * 100);
-            said.extend(ear.hear(2, step, step * 100 + 50).quarantine);
+            receiver.dropped(1, step, step * 100);
+            changes.extend(receiver.receive(2, step, step * 100 + 50).quarantine);
         }
-        assert_eq!(ear.dropped(2, 40, 4_000), Some(DropReason::Identity));
-        // The intruder has gone; the other one goes on.
-        let mut heard_from = None;
+        assert_eq!(receiver.dropped(2, 40, 4_000), Some(DropReason::Identity));
+        // The intruder has gone; the other sender continues.
+        let mut accepted_from = None;
         for step in 40..120_u64 {
-            let verdict = ear.hear(1, step, step * 100);
-            said.extend(verdict.quarantine);
-            if verdict.dropped.is_none() && heard_from.is_none() {
-                heard_from = Some(step * 100);
+            let admission = receiver.receive(1, step, step * 100);
+            changes.extend(admission.quarantine);
+            if admission.dropped.is_none() && accepted_from.is_none() {
+                accepted_from = Some(step * 100);
             }
         }
-        assert!((6_900..=7_300).contains(&heard_from.unwrap()), "{heard_from:?}");
-        assert_eq!(said, [false], "the beginning was said to the other one");
+        assert!((6_900..=7_300).contains(&accepted_from.unwrap()), "{accepted_from:?}");
+        assert_eq!(changes, [false], "its start was reported with a message of the other sender");
     }
 
     #[test]
-    fn a_sender_that_draws_epochs_like_lots_is_silenced() {
-        let mut ear = Ear::new();
-        let verdicts: Vec<_> = (0..20).map(|epoch| ear.dropped(epoch, 0, epoch * 100)).collect();
+    fn a_sender_with_many_epochs_is_quarantined() {
+        let mut receiver = Receiver::new();
+        let verdicts: Vec<_> = (0..20).map(|epoch| receiver.dropped(epoch, 0, epoch * 100)).collect();
         assert!(verdicts[..4].iter().all(Option::is_none));
         assert!(verdicts[6..].iter().all(|dropped| *dropped == Some(DropReason::Identity)), "{verdicts:?}");
     }
 
     #[test]
     fn the_memory_of_topics_is_bounded() {
-        let mut freshness = ReplayWindow::default();
+        let mut replay_window = ReplayWindow::default();
         let begun = Instant::now();
         for vehicle in 0..2 * TOPICS as u64 {
             let topic: Topic = format!("{vehicle}/bev").parse().unwrap();
-            assert_eq!(freshness.admit(&topic, 1, 1, begun + Duration::from_millis(vehicle)).dropped, None);
+            assert_eq!(replay_window.admit(&topic, 1, 1, begun + Duration::from_millis(vehicle)).dropped, None);
         }
-        assert_eq!(freshness.topics.len(), TOPICS);
+        assert_eq!(replay_window.topics.len(), TOPICS);
     }
 }

@@ -1,4 +1,4 @@
-//! Opening the bus: explicit endpoints, no discovery, every limit set on purpose.
+//! Session of zenoh: explicit endpoints, no discovery, every limit set explicitly.
 
 use std::net::{TcpListener, UdpSocket};
 use std::time::{Duration, Instant};
@@ -11,62 +11,62 @@ use super::credentials::{AUTHORITY_FILE, CERTIFICATE_FILE, Credentials, KEY_FILE
 use super::endpoint::Endpoint;
 use super::error::BusError;
 
-/// How long one attempt to open a connection may take.
+/// Timeout of one attempt to open a connection.
 const OPEN_LIMIT: Duration = Duration::from_secs(3);
-/// First and longest pause between two attempts to reach the router again.
+/// First and longest pause between two attempts to reconnect to the router.
 const RETRY_FIRST: Duration = Duration::from_millis(100);
 const RETRY_LONGEST: Duration = Duration::from_secs(1);
-/// Batches of 64 KiB that zenoh takes before a `put` waits, for features and for sensor data. On a slow link that much may
-/// lie before the newest message: an eighth of what a socket's buffer grows to anyway.
+/// Batches of 64 KiB that zenoh queues before a `put` waits, for features and for sensor data. On a slow link that many
+/// bytes may precede the newest message: an eighth of the size to which a socket's buffer grows.
 const TENSOR_BATCHES: usize = 8;
 
-/// Sessions that a router has at once: twice as many as a run of 64 vehicles needs.
+/// Maximum number of sessions of a router: twice as many as a run of 64 vehicles needs.
 const MAX_SESSIONS: usize = 256;
-/// Connections that may be in the middle of introducing themselves.
-const MAX_STRANGERS: usize = 64;
+/// Maximum number of connections in the handshake.
+const MAX_PENDING: usize = 64;
 
-/// How long a client may take to hand over one message: 8 MiB at 1 Mbit/s, and then some. A router that hangs is noticed
-/// much sooner, by its silence.
+/// Timeout of a client for handing over one message: 8 MiB at 1 Mbit/s, with a margin. A hung router is detected much
+/// sooner, by its silence.
 pub(super) const LONGEST_MESSAGE: Duration = Duration::from_secs(120);
-/// The same over QUIC: there nobody tells a client that its router was killed, and a message under way keeps zenoh from
-/// connecting anew until this has passed. 8 MiB at 2.3 Mbit/s.
+/// The same over QUIC: there a client is not notified that its router was killed, and a message in transit keeps zenoh
+/// from reconnecting until this timeout. 8 MiB at 2.3 Mbit/s.
 const LONGEST_SECURED: Duration = Duration::from_secs(30);
-/// The same for a router, whose other messages of the same sender wait meanwhile.
+/// The same for a router, where other messages of the same sender wait meanwhile.
 const LONGEST_DELIVERY: Duration = Duration::from_secs(5);
 
-/// Which end of the star a process is.
+/// Role of a process in the star topology.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Role {
-    /// The middle: routes for all others. One process of a run, usually the one that starts the others.
+    /// The centre: routes for all others. One process of a run, usually the one that starts the others.
     Router {
-        /// Where it listens, for example `tcp/127.0.0.1:7447`.
+        /// Listening endpoint, for example `tcp/127.0.0.1:7447`.
         listen: Endpoint,
     },
-    /// Everyone else.
+    /// All other processes.
     Client {
         /// The router's endpoint.
         connect: Endpoint,
     },
 }
 
-/// How to open a session.
+/// Options of a session.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct BusOptions {
-    /// Router or client, and where.
+    /// Router or client, with its endpoint.
     pub role: Role,
-    /// How long a client tries to reach the router before it gives up.
+    /// Timeout of a client for reaching the router.
     pub patience: Duration,
-    /// Bytes of shared memory for large messages on one machine; `None` keeps everything on the socket, which is what
-    /// experiments with an emulated link need. At least three times the bytes of all maps under way at once.
+    /// Bytes of shared memory for large messages on one machine; `None` keeps all messages on the socket, which
+    /// experiments with an emulated link need. At least three times the bytes of all feature maps in flight at once.
     pub shared_memory_pool: Option<usize>,
-    /// Largest message accepted from outside, in bytes; larger ones close the connection they came on.
+    /// Maximum size of a message from outside, bytes; larger ones close their connection.
     pub max_message_bytes: usize,
-    /// How long handing over one message may take before the connection is closed. Meanwhile a router delivers nothing
-    /// else that the same sender sends, so this bounds what one stuck receiver costs the others.
+    /// Timeout for handing over one message, after which the connection is closed. Meanwhile a router delivers no other
+    /// messages of the same sender, so this bounds the delay that one stalled receiver causes for the others.
     pub stall_limit: Duration,
-    /// Keys: all traffic goes over QUIC, and both ends show certificates of the same authority.
+    /// Keys: all traffic uses QUIC, and both ends present certificates of the same authority.
     pub credentials: Option<Credentials>,
-    /// What a router lets through, by certificate; everything when absent.
+    /// Access control of a router, by certificate; absent: everything is allowed.
     pub guard: Option<AccessControl>,
 }
 
@@ -88,7 +88,8 @@ impl BusOptions {
             role,
             patience: Duration::from_secs(10),
             shared_memory_pool: None,
-            // Twice a full map of OpenCOOD's size (256 x 48 x 176 cells of f32 at stride 4 are 8.7 MB) and every cloud.
+            // Twice a full feature map of OpenCOOD's size (256 x 48 x 176 cells of f32 at stride 4 are 8.7 MB) and
+            // every cloud.
             max_message_bytes: 32 << 20,
             stall_limit,
             credentials: None,
@@ -96,7 +97,7 @@ impl BusOptions {
         }
     }
 
-    /// The same with keys: the endpoint is one of QUIC from here on.
+    /// The same with keys: the endpoint becomes a QUIC endpoint.
     #[must_use]
     pub fn with_credentials(mut self, credentials: Credentials) -> Self {
         let (Role::Router { listen: endpoint } | Role::Client { connect: endpoint }) = &mut self.role;
@@ -106,20 +107,20 @@ impl BusOptions {
         self
     }
 
-    /// The same as a router that lets nothing through but what `guard` says.
+    /// The same as a router with access control.
     #[must_use]
     pub fn with_access_control(self, guard: AccessControl) -> Self {
         Self { guard: Some(guard), ..self }
     }
 
-    /// Where this end listens or connects.
+    /// Endpoint at which this end listens or to which it connects.
     #[must_use]
     pub fn endpoint(&self) -> &Endpoint {
         let (Role::Router { listen: endpoint } | Role::Client { connect: endpoint }) = &self.role;
         endpoint
     }
 
-    /// The same as a configuration for a `zenohd` of its own.
+    /// The same as a configuration for a separate `zenohd`.
     #[must_use]
     pub fn for_zenohd(&self) -> Value {
         let mut whole = json!({});
@@ -156,27 +157,27 @@ impl BusOptions {
                     "period_increase_factor": 2.0,
                 }),
             ),
-            // A neighbour's fleet on the same network must not leak into this run.
+            // A fleet of another user on the same network must not join this run.
             ("scouting/multicast/enabled", json!(false)),
             ("scouting/gossip/enabled", json!(false)),
-            // With nobody to discover there is nothing to wait half a second for.
+            // Without discovery there is no reason to wait half a second.
             ("scouting/delay", json!(0)),
-            // Capture times stand in our own header; the router's clock has no say.
+            // Capture times are in our own header; the router's clock is not used.
             ("timestamping/enabled", json!(false)),
-            // It loses messages over 64 KiB without a word.
+            // It loses messages over 64 KiB without an error.
             ("transport/unicast/lowlatency", json!(false)),
             ("transport/unicast/qos/enabled", json!(true)),
-            // A router that is held up just then answers the next attempt; zenoh would wait 10 s for this one.
+            // A router that is delayed answers the next attempt; zenoh would wait 10 s for this one.
             ("transport/unicast/open_timeout", json!(millis(OPEN_LIMIT))),
-            // Tensors: with zenoh's two batches the thread that writes a message and the one that sends it wait for each
-            // other after every 64 KiB, which costs a fifth of the time that 8 MiB take.
+            // Tensors: with zenoh's two batches the writing and the sending thread wait for each other after every 64
+            // KiB, which costs a fifth of the time of 8 MiB.
             ("transport/link/tx/queue/size/data", json!(TENSOR_BATCHES)),
             ("transport/link/tx/queue/size/data_low", json!(TENSOR_BATCHES)),
             ("transport/link/rx/max_message_size", json!(self.max_message_bytes)),
             ("transport/link/protocols", json!([if self.credentials.is_some() { "quic" } else { "tcp" }])),
             ("transport/unicast/max_sessions", json!(MAX_SESSIONS)),
             ("transport/unicast/max_links", json!(1)),
-            ("transport/unicast/accept_pending", json!(MAX_STRANGERS)),
+            ("transport/unicast/accept_pending", json!(MAX_PENDING)),
             (
                 "transport/link/tx/queue/congestion_control/block/wait_before_close",
                 json!(u64::try_from(self.stall_limit.as_micros()).unwrap_or(u64::MAX)),
@@ -194,14 +195,14 @@ impl BusOptions {
         settings.extend(self.credentials.iter().flat_map(tls_settings));
         if let Some(guard) = &self.guard {
             settings.push(("access_control", guard.rules()));
-            // Where it says what it refused; the guard lets nobody else read there.
+            // Metrics of rejections; access control keeps other processes from reading them.
             settings.push(("adminspace", json!({"enabled": true, "permissions": {"read": true, "write": false}})));
         }
         settings
     }
 }
 
-/// QUIC's handshake is that of TLS 1.3, and so are its settings.
+/// QUIC uses the handshake of TLS 1.3, and its settings.
 fn tls_settings(credentials: &Credentials) -> Vec<(&'static str, Value)> {
     let path = |file| json!(credentials.path(file));
     vec![
@@ -212,7 +213,7 @@ fn tls_settings(credentials: &Credentials) -> Vec<(&'static str, Value)> {
         ("transport/link/tls/connect_certificate", path(CERTIFICATE_FILE)),
         ("transport/link/tls/connect_private_key", path(KEY_FILE)),
         ("transport/link/tls/verify_name_on_connect", json!(true)),
-        // A certificate that has run out ends the connections that it opened.
+        // An expired certificate ends the connections that it opened.
         ("transport/link/tls/close_link_on_expiration", json!(true)),
     ]
 }
@@ -223,7 +224,7 @@ fn tls_settings(credentials: &Credentials) -> Vec<(&'static str, Value)> {
 /// Inside tokio this needs the multi-thread runtime: zenoh panics on a current-thread one.
 ///
 /// # Errors
-/// [`BusError`] names the endpoint and what to do.
+/// [`BusError`] states the endpoint and the remedy.
 pub fn open(options: &BusOptions) -> Result<Session, BusError> {
     if options.credentials.is_none() && options.endpoint().is_secured() {
         return Err(BusError::NoKeys(options.endpoint().clone()));
@@ -231,7 +232,7 @@ pub fn open(options: &BusOptions) -> Result<Session, BusError> {
     let config = config(options)?;
     let began = Instant::now();
     zenoh::open(config).wait().map_err(|cause| match &options.role {
-        // Asked only after zenoh has failed, so the answer cannot race with a successful start.
+        // Checked only after zenoh has failed, so the result cannot race with a successful start.
         Role::Router { listen } if port_in_use(listen) => BusError::PortInUse { endpoint: listen.clone() },
         Role::Router { listen } => BusError::zenoh(format!("listening at {listen}"), &cause),
         Role::Client { connect } => {
@@ -253,10 +254,10 @@ fn config(options: &BusOptions) -> Result<Config, BusError> {
         config.insert_json5(key, &wanted.to_string()).map_err(|cause| BusError::Setting {
             key,
             wanted: wanted.clone(),
-            found: format!("refused: {cause}"),
+            found: format!("rejected: {cause}"),
         })?;
     }
-    // zenoh accepts some keys and ignores them: what counts is what can be read back.
+    // zenoh accepts some keys and ignores them: the values are read back.
     for (key, wanted) in options.settings() {
         let found = config.get_json(key).map_err(|cause| BusError::Setting {
             key,
@@ -270,7 +271,7 @@ fn config(options: &BusOptions) -> Result<Config, BusError> {
     Ok(config)
 }
 
-/// Equality that takes `1` and `1.0` for the same, and looks only at the keys that were set.
+/// Equality that treats `1` and `1.0` as the same, and compares only the keys that were set.
 fn same(found: &Value, wanted: &Value) -> bool {
     match (found, wanted) {
         (Value::Number(found), Value::Number(wanted)) => found.as_f64() == wanted.as_f64(),
@@ -298,7 +299,7 @@ mod tests {
     }
 
     #[test]
-    fn without_keys_nobody_goes_where_keys_are_asked_for() {
+    fn a_secured_endpoint_requires_keys() {
         let endpoint = Endpoint::loopback(7447).secured();
         assert_eq!(endpoint.as_str(), "quic/127.0.0.1:7447");
         assert!(matches!(open(&BusOptions::client(endpoint)), Err(BusError::NoKeys(_))));

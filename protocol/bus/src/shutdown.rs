@@ -1,4 +1,4 @@
-//! Ending on request, and ending in time.
+//! Shutdown on request, within a time limit.
 
 use std::sync::mpsc;
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
@@ -13,18 +13,18 @@ struct State {
     reactions: Vec<Reaction>,
 }
 
-/// A request to end that every thread of a process can see, make, wait for and react to.
+/// A stop request that every thread of a process can read, make, wait for and react to.
 #[derive(Clone, Default)]
 pub struct Stop(Arc<(Mutex<State>, Condvar)>);
 
 impl Stop {
-    /// Nobody has asked yet.
+    /// A request that has not been made.
     #[must_use]
     pub fn new() -> Self {
         Self::default()
     }
 
-    /// Asks everyone to end; the first request runs the reactions.
+    /// Requests the stop; the first request runs the reactions.
     pub fn request(&self) {
         let reactions = {
             let mut state = self.lock();
@@ -37,14 +37,14 @@ impl Stop {
         }
     }
 
-    /// Whether someone has asked.
+    /// True if the stop has been requested.
     #[must_use]
     pub fn requested(&self) -> bool {
         self.lock().requested
     }
 
-    /// RunScope `reaction` when someone asks, at once if that has happened. It must not wait for anything: it is meant for
-    /// closing the mailbox a thread waits at.
+    /// Runs `reaction` at the request, at once if it has been made. It must not wait: it is meant for closing the queue
+    /// at which a thread waits.
     pub fn on_request(&self, reaction: impl FnOnce() + Send + 'static) {
         let mut state = self.lock();
         if state.requested {
@@ -55,7 +55,7 @@ impl Stop {
         }
     }
 
-    /// Waits until someone asks, at most until `deadline`; tells whether someone did.
+    /// Waits for the request, at most until `deadline`; true if it was made.
     #[must_use]
     pub fn wait_until(&self, deadline: Instant) -> bool {
         let mut state = self.lock();
@@ -98,29 +98,29 @@ impl Stop {
         Ok(())
     }
 
-    /// Makes the end of standard input a request: a supervisor that holds the other end of the pipe and writes nothing
-    /// takes its processes with it, however suddenly it dies.
+    /// Makes the end of standard input a request (parent-death pipe): a supervisor that holds the other end of the pipe
+    /// and writes nothing ends its processes with itself, however suddenly it dies.
     ///
     /// # Errors
     /// When the thread that waits for it cannot be started.
     pub fn on_end_of_input(&self) -> std::io::Result<()> {
         let stop = self.clone();
-        thread::Builder::new().name("lifeline".into()).spawn(move || {
-            // A broken pipe is an end like any other.
+        thread::Builder::new().name("parent-death".into()).spawn(move || {
+            // A broken pipe is an end of input too.
             let _ = std::io::copy(&mut std::io::stdin(), &mut std::io::sink());
             stop.request();
         })?;
         Ok(())
     }
 
-    /// Ends the process with exit code 1 when it has not ended by itself `limit` after the first request: a network that
-    /// is stuck must not keep it.
+    /// Ends the process with exit code 1 if it has not ended by itself `limit` after the first request: a stalled
+    /// network must not keep it.
     pub fn enforce(&self, limit: Duration) {
         self.on_request(move || {
-            // Without a thread for it, the operator's second Ctrl-C is left.
+            // Without a thread for it, the operator can still press Ctrl-C a second time.
             let _ = thread::Builder::new().name("enforcer".into()).spawn(move || {
                 thread::sleep(limit);
-                tracing::error!("not ended {limit:?} after it was asked to; giving up what is left");
+                tracing::error!("not ended {limit:?} after the request: exit without cleanup");
                 std::process::exit(1);
             });
         });
@@ -131,20 +131,20 @@ impl Stop {
     }
 }
 
-/// Teardown took longer than it may.
+/// The shutdown exceeded its time limit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("{what} did not end within {limit:?}")]
 pub struct Overdue {
-    /// What was being ended.
+    /// Part that was being ended.
     pub what: &'static str,
-    /// How long it had.
+    /// Time limit.
     pub limit: Duration,
 }
 
-/// RunScope `teardown` on a thread of its own and waits for it for at most `limit`.
+/// Runs `teardown` on a thread of its own and waits for it for at most `limit`.
 ///
 /// Closing a zenoh session over a dead link takes 10 s and undeclaring has no limit at all, so neither may run on a
-/// thread that somebody waits for. An overdue teardown is left behind; the end of the process ends it.
+/// thread that others wait for. An overdue teardown is abandoned; the end of the process ends it.
 ///
 /// # Errors
 /// [`Overdue`] when it is not done in time.
@@ -155,7 +155,7 @@ pub fn within<T: Send + 'static>(
 ) -> Result<T, Overdue> {
     let (done, wait) = mpsc::sync_channel(1);
     let helper = thread::Builder::new().name(format!("end-{what}")).spawn(move || {
-        // The receiver is gone only when it gave up waiting.
+        // The receiver is gone only after the timeout.
         let _ = done.send(teardown());
     });
     let overdue = Overdue { what, limit };
@@ -200,7 +200,7 @@ mod tests {
     }
 
     #[test]
-    fn a_teardown_that_hangs_is_left_behind() {
+    fn a_teardown_that_hangs_is_abandoned() {
         let (release, hang) = mpsc::channel::<()>();
         let overdue = within(Duration::from_millis(20), "a dead link", move || hang.recv()).unwrap_err();
         assert_eq!(overdue.to_string(), "a dead link did not end within 20ms");

@@ -1,6 +1,6 @@
-//! What a process says about itself: which routes it has heard, how its books stand.
+//! Status of a process: publishes its confirmed routes and its ledger.
 //!
-//! One thread says it all, so that neither zenoh's callbacks nor the threads that work wait for the network.
+//! One thread publishes everything, so that neither zenoh's callbacks nor the worker threads wait for the network.
 
 use std::collections::BTreeSet;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -17,101 +17,101 @@ use super::publisher::{payload, unix_nanos};
 use super::watchdog::Watchdog;
 use super::{BusError, MessageStats};
 
-/// How often a process says how its books stand and which routes it has heard, beside every time it hears a probe.
+/// Interval of the heartbeats, which carry ledger and confirmed routes; probes are answered in addition.
 const PERIOD: Duration = Duration::from_millis(500);
-/// Things waiting to be said.
+/// Maximum number of queued control messages.
 const PLACES: usize = 64;
-/// Topics a process reports as heard: whoever receives the list bounds it too.
-const MAX_HEARD: usize = 512;
+/// Maximum number of topics reported as confirmed, equal to the limit of receivers of the list.
+const MAX_CONFIRMED: usize = 512;
 
-enum Notice {
+enum Request {
     Ready,
-    Say { control: Control, capture_nanos: u64 },
+    Control { control: Control, capture_nanos: u64 },
 }
 
-/// A handle to the thread that speaks for this process.
+/// A handle to the status thread of this process.
 #[derive(Clone)]
 pub(super) struct StatusPublisher(Arc<Shared>);
 
 struct Shared {
-    heard: Mutex<BTreeSet<Topic>>,
+    confirmed: Mutex<BTreeSet<Topic>>,
     // Many probes need one answer.
     answer_due: AtomicBool,
-    // Of the thread that works, while it does.
-    pulse: Mutex<Option<Arc<Watchdog>>>,
-    queue: BoundedQueue<(), Notice>,
+    // Of the worker thread, while it works.
+    watchdog: Mutex<Option<Arc<Watchdog>>>,
+    queue: BoundedQueue<(), Request>,
 }
 
 impl StatusPublisher {
     pub(super) fn new() -> Self {
         let queue = BoundedQueue::new(PLACES, 1);
         Self(Arc::new(Shared {
-            heard: Mutex::default(),
+            confirmed: Mutex::default(),
             answer_due: AtomicBool::new(false),
-            pulse: Mutex::default(),
+            watchdog: Mutex::default(),
             queue,
         }))
     }
 
-    /// A message has come on `topic`: its route stands.
-    pub(super) fn heard(&self, topic: &Topic) {
-        let mut heard = self.0.heard.lock().unwrap_or_else(PoisonError::into_inner);
-        if heard.len() < MAX_HEARD && !heard.contains(topic) {
-            heard.insert(topic.clone());
+    /// Marks the route of `topic` as confirmed.
+    pub(super) fn confirm_route(&self, topic: &Topic) {
+        let mut confirmed = self.0.confirmed.lock().unwrap_or_else(PoisonError::into_inner);
+        if confirmed.len() < MAX_CONFIRMED && !confirmed.contains(topic) {
+            confirmed.insert(topic.clone());
         }
     }
 
-    /// A probe has come on `topic`: whoever holds the clock may be waiting for the answer.
+    /// Requests an answer to a probe on `topic`: the process that holds the clock may be waiting for it.
     pub(super) fn probed(&self, topic: &Topic) {
-        self.heard(topic);
+        self.confirm_route(topic);
         if !self.0.answer_due.swap(true, Ordering::AcqRel) {
-            self.push(Notice::Ready);
+            self.push(Request::Ready);
         }
     }
 
-    /// Says `control` to all who listen.
-    pub(super) fn say(&self, control: Control, capture_nanos: u64) {
-        self.push(Notice::Say { control, capture_nanos });
+    /// Publishes `control`.
+    pub(super) fn publish(&self, control: Control, capture_nanos: u64) {
+        self.push(Request::Control { control, capture_nanos });
     }
 
-    /// How the books stand is said only while this thread works; `None`: always.
-    pub(super) fn watch(&self, pulse: Option<Arc<Watchdog>>) {
-        *self.0.pulse.lock().unwrap_or_else(PoisonError::into_inner) = pulse;
+    /// Heartbeats are published only while this thread works; `None`: always.
+    pub(super) fn watch(&self, watchdog: Option<Arc<Watchdog>>) {
+        *self.0.watchdog.lock().unwrap_or_else(PoisonError::into_inner) = watchdog;
     }
 
-    /// Ends the thread after it has said what is queued, and how the books stand at the end.
+    /// Ends the thread after it has published the queued messages and the final ledger.
     pub(super) fn close(&self) {
         self.0.queue.close();
     }
 
-    fn push(&self, notice: Notice) {
-        match self.0.queue.push((), notice) {
-            PushOutcome::Replaced(Notice::Say { control, .. }) => {
-                tracing::error!("the network is stuck: {control:?} was not sent");
+    fn push(&self, request: Request) {
+        match self.0.queue.push((), request) {
+            PushOutcome::Replaced(Request::Control { control, .. }) => {
+                tracing::error!("the network is stalled: {control:?} was not sent");
             }
             PushOutcome::Queued
-            | PushOutcome::Replaced(Notice::Ready)
+            | PushOutcome::Replaced(Request::Ready)
             | PushOutcome::NoLane(_)
             | PushOutcome::Closed(_) => {}
         }
     }
 
-    pub(super) fn speak(&self, speaker: StatusSender) -> Result<JoinHandle<()>, BusError> {
+    pub(super) fn start(&self, sender: StatusSender) -> Result<JoinHandle<()>, BusError> {
         let shared = Arc::clone(&self.0);
         thread::Builder::new()
-            .name("notices".into())
-            .spawn(move || speaker.run(&shared))
-            .map_err(|cause| BusError::Thread { what: "notices".into(), cause })
+            .name("status".into())
+            .spawn(move || sender.run(&shared))
+            .map_err(|cause| BusError::Thread { what: "status".into(), cause })
     }
 }
 
-/// The thread's side.
+/// State of the status thread.
 pub(super) struct StatusSender {
     pub(super) session: Session,
     pub(super) run: RunId,
     pub(super) cav: CavId,
     pub(super) epoch: u64,
-    pub(super) books: MessageStats,
+    pub(super) stats: MessageStats,
 }
 
 impl StatusSender {
@@ -120,15 +120,15 @@ impl StatusSender {
         let mut next = Instant::now() + PERIOD;
         loop {
             match shared.queue.take(Some(next)) {
-                Pop::Item((), Notice::Ready) => self.ready(shared, &mut sequence),
-                Pop::Item((), Notice::Say { control, capture_nanos }) => {
+                Pop::Item((), Request::Ready) => self.ready(shared, &mut sequence),
+                Pop::Item((), Request::Control { control, capture_nanos }) => {
                     self.control(control, capture_nanos, &mut sequence);
                 }
                 Pop::TimedOut => {
                     next = Instant::now() + PERIOD;
                     self.ready(shared, &mut sequence);
-                    let pulse = shared.pulse.lock().unwrap_or_else(PoisonError::into_inner).clone();
-                    if pulse.is_none_or(|pulse| pulse.is_alive(&mut beats)) {
+                    let watchdog = shared.watchdog.lock().unwrap_or_else(PoisonError::into_inner).clone();
+                    if watchdog.is_none_or(|watchdog| watchdog.is_alive(&mut beats)) {
                         self.stats(&mut sequence);
                     }
                 }
@@ -138,11 +138,12 @@ impl StatusSender {
     }
 
     fn ready(&self, shared: &Shared, sequence: &mut u64) {
-        // Cleared first: a probe that comes from here on asks anew.
+        // Cleared first: a probe that arrives from here on requests a new answer.
         shared.answer_due.store(false, Ordering::Release);
-        let heard: Vec<Topic> = shared.heard.lock().unwrap_or_else(PoisonError::into_inner).iter().cloned().collect();
+        let heard: Vec<Topic> =
+            shared.confirmed.lock().unwrap_or_else(PoisonError::into_inner).iter().cloned().collect();
         if !heard.is_empty() {
-            let process = self.books.process().clone();
+            let process = self.stats.process().clone();
             let key = Key::ready(&self.run, &process);
             self.put(&key, Priority::InteractiveHigh, 0, Control::Ready { process, heard }, sequence);
         }
@@ -155,9 +156,9 @@ impl StatusSender {
     }
 
     fn stats(&self, sequence: &mut u64) {
-        let process = self.books.process().clone();
+        let process = self.stats.process().clone();
         let key = Key::stats(&self.run, &process);
-        let stats = Stats { process, ledger: self.books.ledger(), stages: self.books.stages() };
+        let stats = Stats { process, ledger: self.stats.ledger(), stages: self.stats.stages() };
         self.put(&key, Priority::Background, 0, stats, sequence);
     }
 
@@ -172,12 +173,12 @@ impl StatusSender {
         *sequence += 1;
         let encoded = match wire::encode(&stamp, message) {
             Ok(encoded) => encoded,
-            Err(error) => return tracing::error!(%key, "notice cannot be sent: {error}"),
+            Err(error) => return tracing::error!(%key, "status cannot be sent: {error}"),
         };
         let put = self.session.put(key.to_string(), payload(encoded));
         let put = put.congestion_control(CongestionControl::Block).priority(priority).express(true);
         if let Err(cause) = put.wait() {
-            tracing::error!(%key, "zenoh refuses a notice: {cause}");
+            tracing::error!(%key, "zenoh rejected a status: {cause}");
         }
     }
 }

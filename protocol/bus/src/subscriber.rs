@@ -1,4 +1,4 @@
-//! Taking messages off the network's hands at once, and handing them to the thread that works on them.
+//! Subscriptions: filter messages on the network's thread, and queue them for the thread that processes them.
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -17,17 +17,17 @@ use super::status_publisher::StatusPublisher;
 use super::watchdog::Watchdog;
 use super::{BusError, MessageStats};
 
-/// Where a message waits: data and notices of one topic apart, so that a notice never takes the place of data.
+/// Key of a queue lane: data and notifications of one topic are separate, so that a notification never replaces data.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 struct Lane {
     topic: Topic,
     is_notice: bool,
 }
 
-/// What came in.
+/// An item of an inbox.
 #[derive(Debug)]
 pub enum Event {
-    /// A message, its header checked.
+    /// A message with a checked header.
     Message(Arrival),
     /// The publisher of `topic` has ended.
     End {
@@ -35,13 +35,13 @@ pub enum Event {
         topic: Topic,
         /// Its epoch.
         epoch: u64,
-        /// Messages it sent.
+        /// Number of messages that it sent.
         sent: u64,
     },
 }
 
 impl Event {
-    /// Bytes that it holds on to.
+    /// Bytes that the event holds.
     fn bytes(&self) -> usize {
         match self {
             Self::Message(arrival) => arrival.payload.len(),
@@ -50,20 +50,20 @@ impl Event {
     }
 }
 
-/// A message whose header is sound; whether the rest is, decoding tells.
+/// A message with a valid header; the payload is checked when it is decoded.
 #[derive(Debug)]
 pub struct Arrival {
-    /// Where it was published.
+    /// Topic on which it was published.
     pub topic: Topic,
     /// Its header.
     pub header: Header,
-    /// When it arrived.
+    /// Arrival time.
     pub at: Instant,
     payload: ZBytes,
 }
 
 impl Arrival {
-    /// Bytes on the wire, without what the transport adds.
+    /// Bytes on the wire, without the overhead of the transport.
     #[must_use]
     pub fn wire_bytes(&self) -> u64 {
         self.payload.len() as u64
@@ -73,7 +73,7 @@ impl Arrival {
         &self.payload
     }
 
-    /// Decodes the message from the pieces it arrived in, copying its tensor once.
+    /// Decodes the message from its pieces, copying its tensor once.
     ///
     /// # Errors
     /// [`WireError`] as [`wire::decode`].
@@ -82,36 +82,36 @@ impl Arrival {
     }
 }
 
-/// What a thread works on: the messages of all topics it subscribed to, in bounded lanes.
+/// Inbox of a thread: the messages of all topics that it subscribed to, in bounded lanes.
 pub struct Inbox {
-    mailbox: BoundedQueue<Lane, Event>,
-    freshness: Mutex<ReplayWindow>,
-    books: MessageStats,
+    queue: BoundedQueue<Lane, Event>,
+    replay_window: Mutex<ReplayWindow>,
+    stats: MessageStats,
     meters: RateLimiter,
     max_waiting: usize,
     waiting_bytes: AtomicUsize,
-    pulse: Arc<Watchdog>,
+    watchdog: Arc<Watchdog>,
 }
 
 impl Inbox {
-    pub(super) fn new(places: usize, max_topics: usize, books: &MessageStats) -> Arc<Self> {
-        Self::within(InboxLimits::NONE, places, max_topics, books)
+    pub(super) fn new(places: usize, max_topics: usize, stats: &MessageStats) -> Arc<Self> {
+        Self::within(InboxLimits::NONE, places, max_topics, stats)
     }
 
-    pub(super) fn within(limits: InboxLimits, places: usize, max_topics: usize, books: &MessageStats) -> Arc<Self> {
+    pub(super) fn within(limits: InboxLimits, places: usize, max_topics: usize, stats: &MessageStats) -> Arc<Self> {
         Arc::new(Self {
-            // Two lanes a topic: data and notices.
-            mailbox: BoundedQueue::new(places, max_topics.saturating_mul(2)),
-            freshness: Mutex::default(),
-            books: books.clone(),
+            // Two lanes per topic: data and notifications.
+            queue: BoundedQueue::new(places, max_topics.saturating_mul(2)),
+            replay_window: Mutex::default(),
+            stats: stats.clone(),
             meters: RateLimiter::new(limits),
             max_waiting: limits.waiting_bytes,
             waiting_bytes: AtomicUsize::new(0),
-            pulse: Arc::default(),
+            watchdog: Arc::default(),
         })
     }
 
-    /// Bytes of the messages that wait.
+    /// Bytes of the queued messages.
     #[must_use]
     pub fn waiting_bytes(&self) -> usize {
         self.waiting_bytes.load(Ordering::Relaxed)
@@ -119,7 +119,7 @@ impl Inbox {
 
     /// The oldest event, waiting until `deadline` for one.
     pub fn take(&self, deadline: Option<Instant>) -> Pop<Topic, Event> {
-        match self.pulse.wait(|| self.mailbox.take(deadline)) {
+        match self.watchdog.wait(|| self.queue.take(deadline)) {
             Pop::Item(lane, event) => {
                 self.waiting_bytes.fetch_sub(event.bytes(), Ordering::Relaxed);
                 Pop::Item(lane.topic, event)
@@ -129,39 +129,39 @@ impl Inbox {
         }
     }
 
-    /// Of the thread that takes.
-    pub(super) fn pulse(&self) -> &Arc<Watchdog> {
-        &self.pulse
+    /// Watchdog of the consuming thread.
+    pub(super) fn watchdog(&self) -> &Arc<Watchdog> {
+        &self.watchdog
     }
 
-    /// Takes no more; what is inside can still be taken.
+    /// Rejects further events; queued ones can still be taken.
     pub fn close(&self) {
-        self.mailbox.close();
+        self.queue.close();
     }
 
-    /// Decodes `arrival`; an unsound one is counted, logged and answered with `None`.
+    /// Decodes `arrival`; `None` for a malformed message, which is counted and logged.
     pub fn decode<M: Payload>(&self, arrival: &Arrival, limits: &Limits) -> Option<M> {
-        arrival.decode(limits).map_err(|error| self.books.rejected(&arrival.topic, &error)).ok()
+        arrival.decode(limits).map_err(|error| self.stats.rejected(&arrival.topic, &error)).ok()
     }
 
-    /// `topic` brought what is not its sender's to say: counted and logged.
+    /// Counts and logs a message on `topic` whose content its sender may not publish.
     pub(super) fn reject_invalid(&self, topic: &Topic, why: &'static str) {
-        self.books.reject_invalid(topic, why);
+        self.stats.reject_invalid(topic, why);
     }
 
     fn deliver(&self, topic: &Topic, event: Event, places: Option<usize>) {
         let is_notice = matches!(event, Event::End { .. });
         let lane = Lane { topic: topic.clone(), is_notice };
-        // A bound on what all topics hold together; a message that finds it reached is lost, and so is room for it.
+        // Limit on the bytes of all topics together; a message beyond it is lost.
         let bytes = event.bytes();
         let waiting = self.waiting_bytes.fetch_add(bytes, Ordering::Relaxed).saturating_add(bytes);
         if waiting > self.max_waiting && !is_notice {
             self.waiting_bytes.fetch_sub(bytes, Ordering::Relaxed);
-            return self.books.limited(topic, "too much waits here already");
+            return self.stats.limited(topic, "the limit of queued bytes is reached");
         }
         let pushed = match places {
-            Some(places) => self.mailbox.push_within(places, lane, event),
-            None => self.mailbox.push(lane, event),
+            Some(places) => self.queue.push_within(places, lane, event),
+            None => self.queue.push(lane, event),
         };
         let lost = match pushed {
             PushOutcome::Queued => return,
@@ -169,7 +169,7 @@ impl Inbox {
         };
         self.waiting_bytes.fetch_sub(lost.bytes(), Ordering::Relaxed);
         if let Event::Message(arrival) = lost {
-            self.books.dropped(&arrival.topic, DropReason::Superseded);
+            self.stats.dropped(&arrival.topic, DropReason::Superseded);
         }
     }
 }
@@ -183,11 +183,11 @@ impl Subscription {
         session: &zenoh::Session,
         key: &Key,
         (inbox, places): (&Arc<Inbox>, Option<usize>),
-        notices: &StatusPublisher,
+        status: &StatusPublisher,
     ) -> Result<Self, BusError> {
-        inbox.books.subscribed(&key.topic);
+        inbox.stats.subscribed(&key.topic);
         let topic = key.topic.clone();
-        Self::declare(session, &key.to_string(), IngressFilter::new(inbox, places, notices), move |_| {
+        Self::declare(session, &key.to_string(), IngressFilter::new(inbox, places, status), move |_| {
             Some(topic.clone())
         })
     }
@@ -196,30 +196,31 @@ impl Subscription {
         session: &zenoh::Session,
         selector: &KeyExpr,
         inbox: &Arc<Inbox>,
-        notices: &StatusPublisher,
+        status: &StatusPublisher,
     ) -> Result<Self, BusError> {
-        // A key that is none of ours tells of no message of ours either.
+        // Keys outside this grammar carry none of our messages.
         let topic = |sample: &Sample| sample.key_expr().as_str().parse::<Key>().ok().map(|key| key.topic);
-        Self::declare(session, selector.as_str(), IngressFilter::new(inbox, None, notices), topic)
+        Self::declare(session, selector.as_str(), IngressFilter::new(inbox, None, status), topic)
     }
 
     fn declare(
         session: &zenoh::Session,
         key: &str,
-        door: IngressFilter,
+        filter: IngressFilter,
         topic: impl Fn(&Sample) -> Option<Topic> + Send + Sync + 'static,
     ) -> Result<Self, BusError> {
         let subscriber = session.declare_subscriber(key).callback(move |sample| {
             if let Some(topic) = topic(&sample) {
-                door.admit(topic, sample.payload());
+                filter.admit(topic, sample.payload());
             }
         });
         subscriber.wait().map(Self).map_err(|cause| BusError::zenoh(format!("subscribing to {key}"), &cause))
     }
 }
 
-/// Whether notices about a topic's publisher travel on it too: not where notices are all there is.
-pub(super) fn has_notices(topic: &Topic) -> bool {
+/// True if notifications about a topic's publisher are sent on the topic itself: not if the topic carries notifications
+/// only.
+pub(super) fn has_notifications(topic: &Topic) -> bool {
     match topic {
         Topic::Stream { stream: Stream::Preview, .. } => false,
         Topic::Stream { .. } | Topic::Received { .. } | Topic::Truth => true,
@@ -227,21 +228,20 @@ pub(super) fn has_notices(topic: &Topic) -> bool {
     }
 }
 
-/// The callback's side: runs on zenoh's receive thread, so it looks at headers only, waits for nothing and calls no
-/// zenoh.
+/// Ingress filter, run on zenoh's receive thread: reads headers only, waits for nothing and does not call zenoh.
 struct IngressFilter {
     inbox: Arc<Inbox>,
     places: Option<usize>,
-    notices: StatusPublisher,
+    status: StatusPublisher,
 }
 
 impl IngressFilter {
-    fn new(inbox: &Arc<Inbox>, places: Option<usize>, notices: &StatusPublisher) -> Self {
-        Self { inbox: Arc::clone(inbox), places, notices: notices.clone() }
+    fn new(inbox: &Arc<Inbox>, places: Option<usize>, status: &StatusPublisher) -> Self {
+        Self { inbox: Arc::clone(inbox), places, status: status.clone() }
     }
 
     fn admit(&self, topic: Topic, payload: &ZBytes) {
-        // Before anything of it is looked at: a flood must cost next to nothing.
+        // Before anything is read: a flood must cost next to nothing.
         if !self.inbox.meters.admit(&topic, payload.len(), Instant::now()) {
             return self.reject(&topic, payload);
         }
@@ -253,35 +253,35 @@ impl IngressFilter {
             return self.note(topic, &header, payload);
         }
         let at = Instant::now();
-        if has_notices(&topic) {
-            self.inbox.books.arrived(&topic);
-            self.notices.heard(&topic);
+        if has_notifications(&topic) {
+            self.inbox.stats.arrived(&topic);
+            self.status.confirm_route(&topic);
             if let Some(reason) = self.reject_stale(&topic, &header, at) {
-                return self.inbox.books.dropped(&topic, reason);
+                return self.inbox.stats.dropped(&topic, reason);
             }
         }
         let arrival = Arrival { topic: topic.clone(), header, at, payload: payload.clone() };
         self.inbox.deliver(&topic, Event::Message(arrival), self.places);
     }
 
-    /// More than the sender may send. The header alone says whether that is in the sender's books.
+    /// Rejects a message above the rate limit. Its header decides whether the sender has counted it.
     fn reject(&self, topic: &Topic, payload: &ZBytes) {
-        const WHY: &str = "more than its sender may send in that time";
+        const WHY: &str = "above the rate limit of its sender";
         if header_of(topic, payload).is_ok_and(|header| is_notice(topic, &header)) {
-            return self.inbox.books.limited_notice(topic, WHY);
+            return self.inbox.stats.limited_notice(topic, WHY);
         }
-        self.inbox.books.arrived(topic);
-        self.inbox.books.limited(topic, WHY);
+        self.inbox.stats.arrived(topic);
+        self.inbox.stats.limited(topic, WHY);
     }
 
     fn refuse(&self, topic: &Topic, error: &WireError) {
-        self.inbox.books.arrived(topic);
-        self.inbox.books.rejected(topic, error);
+        self.inbox.stats.arrived(topic);
+        self.inbox.stats.rejected(topic, error);
     }
 
     fn note(&self, topic: Topic, header: &Header, payload: &ZBytes) {
         match wire::decode(payload.slices(), &Limits::DEFAULT) {
-            Ok((_, Control::Probe)) => self.notices.probed(&topic),
+            Ok((_, Control::Probe)) => self.status.probed(&topic),
             Ok((_, Control::End { ticks: sent, .. })) => {
                 let end = Event::End { topic: topic.clone(), epoch: header.stamp.epoch, sent };
                 self.inbox.deliver(&topic, end, None);
@@ -291,38 +291,38 @@ impl IngressFilter {
         }
     }
 
-    /// Why a message is not to be used, where it is not news.
+    /// Drop reason of a duplicate or stale message, or of one under quarantine.
     fn reject_stale(&self, topic: &Topic, header: &Header, at: Instant) -> Option<DropReason> {
         let stamp = &header.stamp;
         let Admission { dropped, quarantine } = {
-            let mut freshness = self.inbox.freshness.lock().unwrap_or_else(PoisonError::into_inner);
-            freshness.admit(topic, stamp.epoch, stamp.sequence, at)
+            let mut replay_window = self.inbox.replay_window.lock().unwrap_or_else(PoisonError::into_inner);
+            replay_window.admit(topic, stamp.epoch, stamp.sequence, at)
         };
         match quarantine {
             Some(true) => {
-                tracing::warn!(%topic, "two senders speak under one name: neither is heard until one is silent")
+                tracing::warn!(%topic, "two senders use one id: both are rejected until one is silent")
             }
-            Some(false) => tracing::info!(%topic, "one sender is left under this name: it is heard again"),
+            Some(false) => tracing::info!(%topic, "one sender of this id is left: its messages are accepted again"),
             None => {}
         }
         if dropped.is_none() {
-            self.inbox.books.heard_clock(&stamp.cav, stamp.publish_nanos, unix_nanos(), at);
+            self.inbox.stats.observe_clock(&stamp.cav, stamp.publish_nanos, unix_nanos(), at);
         }
         dropped
     }
 }
 
-/// The header of a message on `topic`, if it is one that may come there.
+/// The header of a message on `topic`, if it is allowed there.
 fn header_of(topic: &Topic, payload: &ZBytes) -> Result<Header, WireError> {
     wire::decode_header(payload.slices()).and_then(|header| check(topic, header))
 }
 
-/// Whether a message is about its publisher, and so in nobody's books.
+/// True if a message is a notification about its publisher, which is not counted.
 fn is_notice(topic: &Topic, header: &Header) -> bool {
-    header.kind == Kind::Control && has_notices(topic)
+    header.kind == Kind::Control && has_notifications(topic)
 }
 
-/// Who may speak on `topic`, and of what.
+/// Checks sender and kind of a message on `topic`.
 fn check(topic: &Topic, header: Header) -> Result<Header, WireError> {
     let expected = match topic {
         Topic::Stream { cav, stream } | Topic::Received { cav, stream, .. } => {
@@ -361,19 +361,19 @@ mod tests {
     }
 
     #[test]
-    fn of_what_is_beyond_the_limit_only_data_are_booked() {
-        let books = MessageStats::new("ego-9".parse().unwrap());
+    fn only_data_beyond_the_limit_are_counted() {
+        let stats = MessageStats::new("ego-9".parse().unwrap());
         let limits = InboxLimits { messages_per_s: 1e-3, ..InboxLimits::PEERS };
-        let (inbox, topic) = (Inbox::within(limits, 4, 4, &books), "7/gnss".parse::<Topic>().unwrap());
-        let door = IngressFilter::new(&inbox, None, &StatusPublisher::new());
-        let counts = || books.ledger().get(&Account::towards(topic.clone(), books.process())).cloned();
-        books.subscribed(&topic);
+        let (inbox, topic) = (Inbox::within(limits, 4, 4, &stats), "7/gnss".parse::<Topic>().unwrap());
+        let filter = IngressFilter::new(&inbox, None, &StatusPublisher::new());
+        let counts = || stats.ledger().get(&Account::towards(topic.clone(), stats.process())).cloned();
+        stats.subscribed(&topic);
         for _ in 0..3 {
-            door.admit(topic.clone(), &bytes(0, Control::Probe));
-            door.admit(topic.clone(), &bytes(0, Control::End { ticks: 0, sent: Vec::new() }));
+            filter.admit(topic.clone(), &bytes(0, Control::Probe));
+            filter.admit(topic.clone(), &bytes(0, Control::End { ticks: 0, sent: Vec::new() }));
         }
         assert_eq!(counts(), Some(Counts::default()));
-        door.admit(topic.clone(), &bytes(0, gnss()));
+        filter.admit(topic.clone(), &bytes(0, gnss()));
         assert_eq!(counts(), Some(Counts { dropped: [(DropReason::RateLimit, 1)].into(), ..Counts::default() }));
     }
 }

@@ -1,13 +1,13 @@
-//! Whether the thread that does a process's work still does.
+//! Watchdog: stops the heartbeats of a process whose worker thread is stalled.
 //!
-//! A thread of its own says how a process is. It would go on saying so for a process whose work stands still.
+//! The status is published by a thread of its own, which would continue while the worker thread is stalled.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
 use super::status_publisher::StatusPublisher;
 
-/// What an inbox knows of the thread that takes from it.
+/// Activity of the thread that takes from an inbox.
 #[derive(Debug, Default)]
 pub(super) struct Watchdog {
     beats: AtomicU64,
@@ -15,12 +15,12 @@ pub(super) struct Watchdog {
 }
 
 impl Watchdog {
-    /// The thread is here.
+    /// Records activity of the thread.
     pub(super) fn beat(&self) {
         self.beats.fetch_add(1, Ordering::Relaxed);
     }
 
-    /// The thread waits for work for as long as `waiting` takes.
+    /// Marks the thread as waiting while `waiting` runs.
     pub(super) fn wait<T>(&self, waiting: impl FnOnce() -> T) -> T {
         self.waits.store(true, Ordering::Relaxed);
         let found = waiting();
@@ -29,35 +29,35 @@ impl Watchdog {
         found
     }
 
-    /// Whether the thread waits, or has been here since `beats` were counted, which are counted anew.
+    /// True if the thread waits, or has been active since `beats` were counted; updates `beats`.
     pub(super) fn is_alive(&self, beats: &mut u64) -> bool {
         let before = std::mem::replace(beats, self.beats.load(Ordering::Relaxed));
         *beats != before || self.waits.load(Ordering::Relaxed)
     }
 }
 
-/// A process that says how it is only while a thread works, see [`super::Bus::works_from`]; until this is dropped.
-#[must_use = "the work is over when this is dropped"]
+/// Ties the status of a process to the activity of a thread, see [`super::Bus::works_from`]; until this is dropped.
+#[must_use = "the watchdog is released when this is dropped"]
 pub struct Heartbeat {
-    notices: StatusPublisher,
-    pulse: Arc<Watchdog>,
+    status: StatusPublisher,
+    watchdog: Arc<Watchdog>,
 }
 
 impl Heartbeat {
-    pub(super) fn begin(notices: &StatusPublisher, pulse: &Arc<Watchdog>) -> Self {
-        notices.watch(Some(Arc::clone(pulse)));
-        Self { notices: notices.clone(), pulse: Arc::clone(pulse) }
+    pub(super) fn begin(status: &StatusPublisher, watchdog: &Arc<Watchdog>) -> Self {
+        status.watch(Some(Arc::clone(watchdog)));
+        Self { status: status.clone(), watchdog: Arc::clone(watchdog) }
     }
 
-    /// The thread is here, though it takes nothing from its inbox.
+    /// Records activity of the thread without taking from the inbox.
     pub fn beat(&self) {
-        self.pulse.beat();
+        self.watchdog.beat();
     }
 }
 
 impl Drop for Heartbeat {
     fn drop(&mut self) {
-        self.notices.watch(None);
+        self.status.watch(None);
     }
 }
 
@@ -66,16 +66,16 @@ mod tests {
     use super::*;
 
     #[test]
-    fn who_waits_or_came_by_is_alive_and_who_does_neither_is_not() {
-        let (pulse, mut beats) = (Watchdog::default(), 0);
-        assert!(!pulse.is_alive(&mut beats));
-        pulse.wait(|| {
-            assert!(pulse.is_alive(&mut 0));
-            assert!(pulse.is_alive(&mut beats), "however long it waits");
+    fn a_waiting_or_active_thread_is_alive() {
+        let (watchdog, mut beats) = (Watchdog::default(), 0);
+        assert!(!watchdog.is_alive(&mut beats));
+        watchdog.wait(|| {
+            assert!(watchdog.is_alive(&mut 0));
+            assert!(watchdog.is_alive(&mut beats), "however long it waits");
         });
-        assert!(pulse.is_alive(&mut beats), "it came back");
-        assert!(!pulse.is_alive(&mut beats), "and has not been here since");
-        pulse.beat();
-        assert!(pulse.is_alive(&mut beats));
+        assert!(watchdog.is_alive(&mut beats), "it came back");
+        assert!(!watchdog.is_alive(&mut beats), "and has not been here since");
+        watchdog.beat();
+        assert!(watchdog.is_alive(&mut beats));
     }
 }

@@ -1,8 +1,8 @@
-//! A small web server for what a process has to show: pages, numbers, streams. GET and HEAD only, HTTP/1.1; over the loopback
-//! under the names of the loopback alone.
+//! Small web server of a process: pages, numbers, streams. GET and HEAD only, HTTP/1.1; over the loopback only under
+//! the names of the loopback.
 //!
-//! It stands beside work that must not wait for it, and faces browsers that never read: it has a thread of its own, nothing
-//! is kept for a reader, every wait has a limit, and who exceeds it is dropped and counted.
+//! It must not delay other work, and browsers may never read: it has a thread of its own, nothing is kept for a reader,
+//! every wait has a limit, and a reader beyond the limits is disconnected and counted.
 
 mod host;
 
@@ -30,56 +30,56 @@ use tokio::runtime::{self, Runtime};
 use tokio::sync::Semaphore;
 use tokio_io_timeout::TimeoutStream;
 
-/// Connections at once; more are refused.
+/// Maximum number of connections; more are refused.
 const MAX_CONNECTIONS: usize = 24;
-/// Documents that are put together at once.
+/// Maximum number of documents generated at once.
 const MAX_HANDLERS: usize = 4;
-/// Bytes of a request's head, and of an answer that wait for its reader beside the system's own.
+/// Maximum bytes of a request's head, and of an answer waiting for its reader, without the system's own buffers.
 const MAX_WAITING: usize = 16 << 10;
-/// How long a request may take to come.
+/// Timeout for receiving a request.
 const READ_LIMIT: Duration = Duration::from_secs(5);
-/// How long a reader may take no byte.
+/// Timeout for a reader that takes no byte.
 const WRITE_LIMIT: Duration = Duration::from_secs(2);
-/// How long to wait when the system has no room for another connection.
+/// Pause when the system has no room for another connection.
 const PAUSE: Duration = Duration::from_millis(100);
 
-/// A page may load nothing but what this server gives it.
+/// A page may load content of this server only.
 const POLICY: &str = "default-src 'self'; img-src 'self' data:; style-src 'self' 'unsafe-inline'";
 const TEXT: &str = "text/plain; charset=utf-8";
 
-/// What was asked for.
+/// A request.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Request {
     /// Path, for example `/frame/3`.
     pub path: String,
-    /// What stands behind the `?`, if anything.
+    /// Part after the `?`, if any.
     pub query: String,
 }
 
-/// What is answered.
+/// An answer.
 pub enum Answer {
     /// A whole document.
     Page {
         /// For example `text/html; charset=utf-8`.
         content_type: &'static str,
-        /// Its bytes.
+        /// Content of the document.
         body: Bytes,
     },
-    /// Bytes as they come, asked for when the reader has taken those before.
+    /// Bytes as they are generated, requested when the reader has taken the previous ones.
     Stream {
         /// For example `application/octet-stream`.
         content_type: &'static str,
-        /// Where they come from.
+        /// Source of the bytes.
         pieces: BoxStream<'static, Bytes>,
     },
-    /// There is no such thing, in words.
+    /// Not found, with a text.
     NotFound(String),
 }
 
 type Handler = dyn Fn(&Request) -> Answer + Send + Sync;
 type Body = UnsyncBoxBody<Bytes, Infallible>;
 
-/// Readers of a server, for those who count.
+/// Readers of a server, as counters.
 #[derive(Debug)]
 pub struct Readers {
     places: Arc<Semaphore>,
@@ -87,20 +87,20 @@ pub struct Readers {
 }
 
 impl Readers {
-    /// Connections right now.
+    /// Number of open connections.
     #[must_use]
     pub fn open(&self) -> usize {
         MAX_CONNECTIONS - self.places.available_permits()
     }
 
-    /// Readers that did not read, and connections beyond those there may be.
+    /// Number of readers that did not read, and of connections beyond the maximum.
     #[must_use]
     pub fn dropped(&self) -> u64 {
         self.dropped.load(Ordering::Relaxed)
     }
 }
 
-/// A server at work; ends when dropped, and all its connections with it.
+/// A running server; ends when dropped, with all its connections.
 pub struct WebServer {
     address: SocketAddr,
     readers: Arc<Readers>,
@@ -108,11 +108,11 @@ pub struct WebServer {
 }
 
 impl WebServer {
-    /// Serves what `handler` answers at `address`; port 0 takes any free one. The handler may take its time: it has threads
-    /// of its own.
+    /// Serves the answers of `handler` at `address`; port 0: any free port. The handler may be slow: it has threads of
+    /// its own.
     ///
     /// # Errors
-    /// When the address cannot be listened at, or the system gives no thread.
+    /// When the address cannot be bound, or the system cannot start a thread.
     pub fn start(
         address: SocketAddr,
         handler: impl Fn(&Request) -> Answer + Send + Sync + 'static,
@@ -128,7 +128,7 @@ impl WebServer {
         Ok(Self { address, readers, runtime: Some(runtime) })
     }
 
-    /// Where it listens.
+    /// Address of the server.
     #[must_use]
     pub fn address(&self) -> SocketAddr {
         self.address
@@ -144,13 +144,13 @@ impl WebServer {
 impl Drop for WebServer {
     fn drop(&mut self) {
         if let Some(runtime) = self.runtime.take() {
-            // Waits for nobody: neither for readers nor for a handler at work.
+            // Waits neither for readers nor for a running handler.
             runtime.shutdown_background();
         }
     }
 }
 
-/// Gives every connection a task, where there are not too many.
+/// Starts a task for every connection, up to the maximum.
 async fn accept(listener: TcpListener, handler: Arc<Handler>, readers: Arc<Readers>) {
     loop {
         let Ok((connection, _)) = listener.accept().await else {
@@ -167,7 +167,7 @@ async fn accept(listener: TcpListener, handler: Arc<Handler>, readers: Arc<Reade
                 && was_not_read(&error)
             {
                 readers.dropped.fetch_add(1, Ordering::Relaxed);
-                tracing::warn!("a reader that does not read is dropped");
+                tracing::warn!("a reader that does not read is disconnected");
             }
             drop(place);
         });
@@ -175,7 +175,7 @@ async fn accept(listener: TcpListener, handler: Arc<Handler>, readers: Arc<Reade
 }
 
 async fn serve(connection: TcpStream, handler: Arc<Handler>) -> hyper::Result<()> {
-    // What is late for want of it is late, and no more.
+    // Without it the answer is late, but complete.
     let _ = connection.set_nodelay(true);
     let local = connection.local_addr();
     let mut connection = TimeoutStream::new(connection);
@@ -190,13 +190,13 @@ async fn serve(connection: TcpStream, handler: Arc<Handler>) -> hyper::Result<()
         .await
 }
 
-/// A request that does not come ends a connection too, but is no reader: browsers open some to be quick later.
+/// A missing request ends a connection too, but is not counted as a reader: browsers open spare connections.
 fn was_not_read(error: &hyper::Error) -> bool {
     let cause = error.source().and_then(|cause| cause.downcast_ref::<io::Error>());
     cause.is_some_and(|cause| cause.kind() == io::ErrorKind::TimedOut)
 }
 
-/// What is answered at `local`, this end of the connection. The body of an answer to HEAD is left out on its way.
+/// Answers a request at `local`, this end of the connection. The body of an answer to HEAD is omitted on sending.
 async fn answer(
     handler: Arc<Handler>,
     local: Option<SocketAddr>,
@@ -210,8 +210,8 @@ async fn answer(
     if let Some(local) = local
         && let Err(name) = host::check(local, request.uri(), request.headers())
     {
-        let words = format!("this server is called localhost, not {name:?}");
-        return Ok(respond(StatusCode::FORBIDDEN, TEXT, whole(words.into())));
+        let message = format!("this server is called localhost, not {name:?}");
+        return Ok(respond(StatusCode::FORBIDDEN, TEXT, whole(message.into())));
     }
     let (path, query) = (request.uri().path().to_owned(), request.uri().query().unwrap_or_default().to_owned());
     let answer = tokio::task::spawn_blocking(move || handler(&Request { path, query })).await;
@@ -221,7 +221,7 @@ async fn answer(
             let body = StreamBody::new(pieces.map(|piece| Ok(Frame::data(piece))));
             respond(StatusCode::OK, content_type, body.boxed_unsync())
         }
-        Ok(Answer::NotFound(words)) => respond(StatusCode::NOT_FOUND, TEXT, whole(words.into())),
+        Ok(Answer::NotFound(message)) => respond(StatusCode::NOT_FOUND, TEXT, whole(message.into())),
         Err(panicked) => respond(StatusCode::INTERNAL_SERVER_ERROR, TEXT, whole(panicked.to_string().into())),
     })
 }
@@ -251,7 +251,7 @@ fn respond(status: StatusCode, content_type: &'static str, body: Body) -> Respon
 pub fn fetch(address: SocketAddr, path: &str) -> io::Result<(String, Vec<u8>)> {
     let mut connection = std::net::TcpStream::connect(address)?;
     connection.set_read_timeout(Some(READ_LIMIT))?;
-    // Version 1.0 asks for a body in one piece that ends with the connection.
+    // HTTP/1.0 gives a body in one piece that ends with the connection.
     write!(connection, "GET {path} HTTP/1.0\r\n\r\n")?;
     let mut answer = Vec::new();
     connection.read_to_end(&mut answer)?;
@@ -291,8 +291,8 @@ mod tests {
         assert_eq!((status.as_str(), body.as_slice()), ("HTTP/1.0 404 Not Found", b"no /../etc".as_slice()));
     }
 
-    /// What is answered to a request without a body.
-    fn asked(server: &WebServer, request: &str) -> String {
+    /// The answer to a request without a body.
+    fn response_to(server: &WebServer, request: &str) -> String {
         let mut connection = TcpStream::connect(server.address()).unwrap();
         write!(connection, "{request}\r\n\r\n").unwrap();
         let mut answer = String::new();
@@ -303,7 +303,7 @@ mod tests {
     #[test]
     fn anything_but_get_and_head_is_refused() {
         let server = server(|_| Answer::NotFound(String::new()));
-        let answer = asked(&server, "POST / HTTP/1.1\r\nHost: localhost");
+        let answer = response_to(&server, "POST / HTTP/1.1\r\nHost: localhost");
         assert!(answer.starts_with("HTTP/1.1 405") && answer.contains("allow: GET, HEAD"), "{answer}");
     }
 
@@ -317,20 +317,20 @@ mod tests {
             }
             other => Answer::NotFound(other.to_owned()),
         });
-        let head = asked(&server, "HEAD /page HTTP/1.1\r\nHost: localhost");
+        let head = response_to(&server, "HEAD /page HTTP/1.1\r\nHost: localhost");
         assert!(head.starts_with("HTTP/1.1 200") && head.contains("content-length: 12\r\n"), "{head}");
         assert!(head.ends_with("\r\n\r\n"), "{head}");
-        assert!(asked(&server, "HEAD /stream HTTP/1.1\r\nHost: localhost").ends_with("\r\n\r\n"));
-        assert!(asked(&server, "HEAD /none HTTP/1.1\r\nHost: localhost").starts_with("HTTP/1.1 404"));
+        assert!(response_to(&server, "HEAD /stream HTTP/1.1\r\nHost: localhost").ends_with("\r\n\r\n"));
+        assert!(response_to(&server, "HEAD /none HTTP/1.1\r\nHost: localhost").starts_with("HTTP/1.1 404"));
     }
 
     #[test]
-    fn a_page_of_another_name_is_told_nothing() {
+    fn a_request_under_another_name_is_rejected() {
         let server = server(|_| Answer::Page { content_type: TEXT, body: "secret".into() });
-        let answer = asked(&server, &format!("GET / HTTP/1.1\r\nHost: evil.example:{}", server.address().port()));
+        let answer = response_to(&server, &format!("GET / HTTP/1.1\r\nHost: evil.example:{}", server.address().port()));
         assert!(answer.starts_with("HTTP/1.1 403") && !answer.contains("secret"), "{answer}");
         assert!(answer.contains("evil.example"), "{answer}");
-        let answer = asked(&server, &format!("GET / HTTP/1.1\r\nHost: {}", server.address()));
+        let answer = response_to(&server, &format!("GET / HTTP/1.1\r\nHost: {}", server.address()));
         assert!(answer.starts_with("HTTP/1.1 200") && answer.contains("secret"), "{answer}");
     }
 
@@ -347,18 +347,19 @@ mod tests {
     }
 
     #[test]
-    fn a_crowd_is_not_let_in() {
+    fn connections_beyond_the_maximum_are_refused() {
         let server = server(|_| Answer::NotFound(String::new()));
-        let crowd: Vec<_> = (0..MAX_CONNECTIONS + 3).map(|_| TcpStream::connect(server.address()).unwrap()).collect();
+        let connections: Vec<_> =
+            (0..MAX_CONNECTIONS + 3).map(|_| TcpStream::connect(server.address()).unwrap()).collect();
         wait_for("three are refused", || server.readers().dropped() == 3);
-        wait_for("those who ask for nothing have to go", || server.readers().open() == 0);
+        wait_for("idle connections are closed", || server.readers().open() == 0);
         assert_eq!(server.readers().dropped(), 3, "and are no readers");
-        drop(crowd);
+        drop(connections);
         assert!(fetch(server.address(), "/").is_ok());
     }
 
     #[test]
-    fn a_handler_that_panics_and_one_that_takes_its_time_harm_nobody() {
+    fn a_panicking_or_slow_handler_affects_no_other_request() {
         let server = server(|request| match request.path.as_str() {
             "/panic" => panic!("as it is meant to"),
             "/slow" => {
@@ -375,7 +376,7 @@ mod tests {
         assert!(fetch(address, "/").unwrap().0.contains("200"));
         let began = Instant::now();
         drop(server);
-        // With an answer that nobody will give, or with none.
+        // With an answer that never arrives, or with none.
         let _ = waiting.read_to_end(&mut Vec::new());
         assert!(began.elapsed() < Duration::from_secs(60), "the connection ends with the server");
     }

@@ -1,11 +1,11 @@
-//! zstd around a body.
+//! Compression of a body with zstd.
 
 use crate::WireError;
 
-/// Packs `bytes`; `None` where that would not make them fewer.
+/// Compresses `bytes`; `None` if that does not make them fewer.
 ///
 /// # Errors
-/// [`WireError::Compression`] when zstd refuses, for example for lack of memory.
+/// [`WireError::Compression`] when zstd fails, for example for lack of memory.
 pub(super) fn pack(bytes: &[u8], level: i32) -> Result<Option<Vec<u8>>, WireError> {
     let packed = zstd::bulk::compress(bytes, level).map_err(|error| WireError::Compression {
         bytes: 0,
@@ -15,26 +15,27 @@ pub(super) fn pack(bytes: &[u8], level: i32) -> Result<Option<Vec<u8>>, WireErro
     Ok(Some(packed).filter(|packed| packed.len() < bytes.len()))
 }
 
-/// Unpacks to exactly `expected` bytes, a size the caller has checked against its limits. The decoder writes into a
-/// buffer of that size and fails at its end, whatever the frame claims: a bomb has nowhere to go off. All at once, so that
-/// zstd reads back what it has written and keeps no window of its own, however large a one the frame asks for.
+/// Decompresses to exactly `expected` bytes, a size that the caller has checked against its limits. The decoder writes
+/// into a buffer of that size and fails at its end, whatever the frame claims, so a decompression bomb has no effect.
+/// The frame is decoded in one call: zstd then reads back its own output and allocates no window, however large the
+/// window that the frame asks for.
 ///
 /// # Errors
-/// [`WireError::Compression`] when the frame is broken, or unpacks to more or fewer bytes.
+/// [`WireError::Compression`] when the frame is corrupt, or decompresses to more or fewer bytes.
 pub(super) fn unpack(packed: Vec<u8>, expected: usize) -> Result<Vec<u8>, WireError> {
     let refuse =
         |detail: String| WireError::Compression { bytes: packed.len() as u64, expected: expected as u64, detail };
-    // A frame says how much it holds, before anything is allocated for it.
+    // A frame states its content size before anything is allocated for it.
     match zstd::zstd_safe::get_frame_content_size(&packed).map_err(|_| refuse("no zstd frame".into()))? {
         Some(claimed) if claimed == expected as u64 => {}
-        Some(claimed) => return Err(refuse(format!("the frame holds {claimed}"))),
-        None => return Err(refuse("the frame does not say how much it holds".into())),
+        Some(claimed) => return Err(refuse(format!("the frame states {claimed} bytes of content"))),
+        None => return Err(refuse("the frame does not state its content size".into())),
     }
     let mut bytes = Vec::with_capacity(expected);
     let found = zstd::bulk::Decompressor::new()
         .and_then(|mut decompressor| decompressor.decompress_to_buffer(&packed, &mut bytes))
         .map_err(|error| refuse(error.to_string()))?;
-    if found == expected { Ok(bytes) } else { Err(refuse(format!("the frame holds {found}"))) }
+    if found == expected { Ok(bytes) } else { Err(refuse(format!("the frame contains {found} bytes"))) }
 }
 
 #[cfg(test)]
@@ -66,11 +67,12 @@ mod tests {
         assert_eq!(pack(&bytes, 3).unwrap(), None);
     }
 
-    /// A sound frame of zeros whose window descriptor asks for 2 GiB, with or without its size; the format is RFC 8878's.
-    fn wide(bytes: u32, says_size: bool) -> Vec<u8> {
+    /// A valid frame of zeros whose window descriptor asks for 2 GiB, with or without its content size; format: RFC
+    /// 8878.
+    fn wide(bytes: u32, states_size: bool) -> Vec<u8> {
         const BLOCK: u32 = 128 << 10;
-        let mut frame = vec![0x28, 0xb5, 0x2f, 0xfd, if says_size { 0x80 } else { 0 }, 21 << 3];
-        frame.extend(bytes.to_le_bytes().iter().filter(|_| says_size));
+        let mut frame = vec![0x28, 0xb5, 0x2f, 0xfd, if states_size { 0x80 } else { 0 }, 21 << 3];
+        frame.extend(bytes.to_le_bytes().iter().filter(|_| states_size));
         for begin in (0..bytes).step_by(BLOCK as usize) {
             // One byte, repeated.
             let len = BLOCK.min(bytes - begin);
@@ -82,19 +84,19 @@ mod tests {
     }
 
     #[test]
-    fn a_huge_window_takes_nothing_and_a_frame_without_size_is_refused() {
+    fn a_huge_window_allocates_nothing_and_a_frame_without_size_is_refused() {
         let zeros = 300 << 10;
         assert_eq!(unpack(wide(zeros, true), zeros as usize).unwrap(), vec![0; zeros as usize]);
         let error = unpack(wide(zeros, false), zeros as usize).unwrap_err();
-        assert!(error.to_string().contains("does not say"), "{error}");
+        assert!(error.to_string().contains("does not state"), "{error}");
     }
 
     #[test]
-    fn a_bomb_goes_nowhere() {
+    fn a_decompression_bomb_is_refused() {
         let bomb = pack(&vec![0; 64 << 20], 19).unwrap().unwrap();
         assert!(bomb.len() < 10_000);
         assert!(matches!(unpack(bomb.clone(), 1000), Err(WireError::Compression { .. })));
-        // Two frames that together hold more than announced.
+        // Two frames that together contain more than announced.
         let mut twice = pack(&[0; 1000], 3).unwrap().unwrap();
         twice.extend(bomb);
         assert!(matches!(unpack(twice, 1000), Err(WireError::Compression { .. })));

@@ -1,4 +1,4 @@
-//! How exactly a feature value is written.
+//! Number formats of feature values: `f32`, `f16` and scaled `i8`.
 
 use bytemuck::{cast_slice, cast_slice_mut};
 use half::f16;
@@ -11,16 +11,16 @@ use crate::WireError;
 const BLOCK: usize = 1024;
 /// Steps of the signed byte scale on either side of zero.
 const I8_STEPS: f32 = 127.0;
-/// Adding 1.5 * 2^23 to a small number rounds it to an integer (ties to even), which then stands in the low bits. Kept
-/// because `f32::round` is a library call on the x86-64 baseline, six times slower for a whole map.
+/// Adding 1.5 * 2^23 to a small number rounds it to an integer (ties to even), which is then in the low bits. Kept
+/// because `f32::round` is a library call on the x86-64 baseline, six times slower for a whole feature map.
 const ROUND: f32 = 12_582_912.0;
 
-/// How a value is written.
+/// Number format of feature values.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 #[cfg_attr(feature = "config", derive(clap::ValueEnum, schemars::JsonSchema))]
 pub enum Dtype {
-    /// As it is: 4 bytes, exact.
+    /// Single precision: 4 bytes, exact.
     #[default]
     F32,
     /// Half precision: 2 bytes, relative error at most 2^-11 down to 6e-5, absolute below; at most 65504.
@@ -41,13 +41,13 @@ impl Dtype {
     }
 }
 
-/// The scale of each channel of `[C, K]` values; zero where every value is (next to) zero.
+/// The scale of each channel of `[C, K]` values; zero where every value is zero or close to it.
 pub(super) fn scales(values: &[f32], channels: usize) -> Vec<f32> {
     if values.is_empty() {
         return vec![0.0; channels];
     }
     let scale = |channel: &[f32]| {
-        // Without the sign, the order of bit patterns is that of the numbers, and integers have a vector maximum.
+        // Without the sign, bit patterns have the order of the numbers, and integers have a vectorised maximum.
         let largest = channel.iter().fold(0i32, |largest, value| largest.max(value.abs().to_bits() as i32));
         let largest = f32::from_bits(largest as u32);
         let scale = largest / I8_STEPS;
@@ -57,7 +57,7 @@ pub(super) fn scales(values: &[f32], channels: usize) -> Vec<f32> {
     values.chunks_exact(values.len() / channels).map(scale).collect()
 }
 
-/// Appends `[C, K]` finite values; `scales` are those of their channels where the dtype has any.
+/// Appends `[C, K]` finite values; `scales` are those of their channels if the dtype has any.
 ///
 /// # Errors
 /// [`WireError::Value`] when a value is beyond the range of half precision.
@@ -82,7 +82,7 @@ fn append_f16(values: &[f32], bytes: &mut Vec<u8>) -> Result<(), WireError> {
     for (number, chunk) in values.chunks(BLOCK).enumerate() {
         let block = &mut block[..chunk.len()];
         block.convert_from_f32_slice(chunk);
-        // Searched for only where there is one: the search does not vectorise.
+        // Searched only if there is one: the search does not vectorise.
         let finite = block.iter().fold(true, |finite, half| finite & half.is_finite());
         if !finite && let Some(at) = block.iter().position(|half| !half.is_finite()) {
             let (index, value) = (number * BLOCK + at, f64::from(chunk[at]));
@@ -93,7 +93,7 @@ fn append_f16(values: &[f32], bytes: &mut Vec<u8>) -> Result<(), WireError> {
     Ok(())
 }
 
-/// Reads `[C, K]` values, `selected` = K; they are finite only if their bytes say so, except that scales are checked.
+/// Reads `[C, K]` values, `selected` = K. Values are not checked to be finite here, scales are.
 ///
 /// # Errors
 /// [`WireError::Value`] when a scale is not a finite number of at least zero.
@@ -105,7 +105,7 @@ pub(super) fn read(dtype: Dtype, scales: &[u8], bytes: &[u8], selected: usize) -
         Dtype::F16 => {
             let (mut halves, mut floats) = ([f16::ZERO; BLOCK], [0f32; BLOCK]);
             for chunk in bytes.chunks(2 * BLOCK) {
-                // Through the stack, because the bytes lie at any address.
+                // Through the stack, because the bytes may be unaligned.
                 cast_slice_mut(&mut halves)[..chunk.len()].copy_from_slice(chunk);
                 let floats = &mut floats[..chunk.len() / 2];
                 halves[..floats.len()].convert_to_f32_slice(floats);
@@ -173,7 +173,7 @@ mod tests {
             let back = round_trip(Dtype::I8, &values, 4).unwrap();
             for (channel, (values, back)) in values.chunks(in_channel).zip(back.chunks(in_channel)).enumerate() {
                 let largest = values.iter().fold(0f32, |largest, value| largest.max(value.abs()));
-                // One in a million for the arithmetic of scale and inverse themselves.
+                // One millionth more for the rounding of scale and inverse.
                 let bound = largest / 127.0 * 0.5 + largest * 1e-6;
                 for (value, back) in values.iter().zip(back) {
                     prop_assert!((value - back).abs() <= bound, "channel {channel}: {value} came back as {back}");

@@ -1,4 +1,4 @@
-//! Which cells are worth sending: those around which a vehicle is likely (Where2comm, Hu et al., NeurIPS 2022).
+//! Confidence gate: selects the cells around which a vehicle is likely (Where2comm, Hu et al., NeurIPS 2022).
 
 use std::str::FromStr;
 
@@ -12,21 +12,22 @@ const MAX_KERNEL: u32 = 63;
 
 /// Sends the cells whose smoothed confidence is above a threshold.
 ///
-/// The decision is the sender's alone, before anything is on the air: where it sees nothing, nothing is sent.
+/// The sender decides without other agents, before anything is transmitted: a sender that detects nothing sends
+/// nothing.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 #[cfg_attr(feature = "config", derive(schemars::JsonSchema))]
 pub struct ConfidenceGate {
-    /// Smoothed confidence that a cell must exceed. Below zero: every cell passes.
+    /// Smoothed confidence that a cell must exceed. Below zero every cell passes.
     pub threshold: f32,
-    /// How the confidence is spread to the surroundings of a vehicle first; `None`: not at all.
+    /// Smoothing of the confidence before the threshold; `None`: no smoothing.
     pub smoothing: Option<Smoothing>,
 }
 
-/// A Gaussian window over the lattice, zeros outside of it.
+/// A Gaussian window over the BEV grid, zeros outside of it.
 ///
-/// As in the published code its weights are `exp(-(x^2 + y^2) / (2 sigma^2)) / (2 pi sigma)`: they add up to about `sigma`,
-/// not to one, so thresholds belong to a sigma.
+/// As in the published code its weights are `exp(-(x^2 + y^2) / (2 sigma^2)) / (2 pi sigma)`: their sum is about
+/// `sigma`, not one, so a threshold is valid for one sigma only.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 #[cfg_attr(feature = "config", derive(schemars::JsonSchema))]
@@ -75,7 +76,7 @@ impl ConfidenceGate {
     /// The cells that pass, in row-major order; `confidence` is `[H, W]` on `grid`, one finite value per cell.
     ///
     /// # Errors
-    /// [`WireError::Value`] when the window has no middle, is too wide, or its sigma is not positive.
+    /// [`WireError::Value`] when the window has an even width, is too wide, or its sigma is not positive.
     pub(super) fn cells(&self, confidence: &[f32], grid: &BevGrid) -> Result<Vec<u32>, WireError> {
         let threshold = self.threshold;
         let pass = |values: &[f32]| -> Vec<u32> {
@@ -110,7 +111,7 @@ impl Smoothing {
         Ok(smoothed)
     }
 
-    /// One dimension of the window, whose weights are products of two.
+    /// One dimension of the separable window.
     fn weights(&self) -> Result<Vec<f32>, WireError> {
         let Self { kernel, sigma } = *self;
         let refuse = |what, value, max| Err(WireError::Value { what, index: 0, value, min: 1e-3, max });
@@ -127,7 +128,7 @@ impl Smoothing {
     }
 }
 
-/// `weights` moved over `values`, zeros outside.
+/// Convolution of `values` with `weights`, zeros outside.
 fn convolve(values: &[f32], weights: &[f32], smoothed: &mut [f32]) {
     let half = weights.len() / 2;
     for (cell, smoothed) in smoothed.iter_mut().enumerate() {
@@ -162,16 +163,16 @@ mod tests {
     }
 
     #[test]
-    fn a_sure_cell_brings_its_surroundings() {
+    fn a_confident_cell_selects_its_surroundings() {
         let mut confidence = [0f32; 30];
         confidence[14] = 0.9;
-        let alone = ConfidenceGate { threshold: 0.01, smoothing: None };
-        assert_eq!(alone.cells(&confidence, &GRID).unwrap(), [14]);
+        let unsmoothed = ConfidenceGate { threshold: 0.01, smoothing: None };
+        assert_eq!(unsmoothed.cells(&confidence, &GRID).unwrap(), [14]);
         let published = ConfidenceGate::default().cells(&confidence, &GRID).unwrap();
         assert!(published.contains(&13) && published.contains(&8) && published.len() > 9, "{published:?}");
-        let nothing = ConfidenceGate { threshold: 1.0, ..alone };
+        let nothing = ConfidenceGate { threshold: 1.0, ..unsmoothed };
         assert!(nothing.cells(&confidence, &GRID).unwrap().is_empty());
-        let everything = ConfidenceGate { threshold: -1.0, ..alone };
+        let everything = ConfidenceGate { threshold: -1.0, ..unsmoothed };
         assert_eq!(everything.cells(&confidence, &GRID).unwrap().len(), 30);
     }
 
@@ -188,7 +189,7 @@ mod tests {
     }
 
     #[test]
-    fn windows_without_a_middle_are_refused() {
+    fn even_windows_are_refused() {
         for smoothing in [(4, 1.0), (0, 1.0), (65, 1.0), (5, 0.0), (5, f32::NAN)] {
             let smoothing = Smoothing { kernel: smoothing.0, sigma: smoothing.1 };
             let gate = ConfidenceGate { threshold: 0.1, smoothing: Some(smoothing) };

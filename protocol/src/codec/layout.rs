@@ -1,4 +1,4 @@
-//! The sizes of an encoded map, all computed in one place and checked before anything is allocated.
+//! Sizes of an encoded feature map, computed in one place and checked before anything is allocated.
 
 use std::ops::Range;
 
@@ -7,11 +7,11 @@ use crate::BevGrid;
 use crate::Limits;
 use crate::WireError;
 
-/// Where the parts of an unpacked body lie, and how many cells it has.
+/// Byte ranges of the parts of an unpacked body, and its number of cells.
 pub(super) struct Layout {
-    /// Cells of the lattice.
+    /// Cells of the grid.
     pub(super) cells: usize,
-    /// Cells that the body brings.
+    /// Cells in the body.
     pub(super) selected: usize,
     /// Bytes of the scales.
     pub(super) scales: Range<usize>,
@@ -22,7 +22,7 @@ pub(super) struct Layout {
 }
 
 impl Layout {
-    /// All sizes of a map, with every product checked against overflow and limits.
+    /// All sizes of a feature map, with every product checked against overflow and limits.
     pub(super) fn new(grid: &BevGrid, channels: u32, codec: &Codec, limits: &Limits) -> Result<Self, WireError> {
         grid.check(limits)?;
         let cells = u64::from(grid.width) * u64::from(grid.height);
@@ -30,7 +30,7 @@ impl Layout {
         if channels == 0 {
             return Err(WireError::Shape { what: "channels", expected: 1, found: 0 });
         }
-        // What a receiver unpacks to is always the whole map, however few bytes claim it.
+        // A receiver always unpacks to the whole feature map, however few bytes claim it.
         let map_bytes = cells.saturating_mul(u64::from(channels)).saturating_mul(4);
         at_most("feature map bytes", limits.max_body_bytes.min(isize::MAX as u64), map_bytes)?;
         let (selected, mask_bytes) = match codec.selection {
@@ -39,7 +39,7 @@ impl Layout {
         };
         at_most("selected cells", cells, selected)?;
         let scale_bytes = if codec.dtype == Dtype::I8 { 4 * u64::from(channels) } else { 0 };
-        // Below the size of the whole map, which fits: the products cannot overflow.
+        // Below the size of the whole feature map, which fits: the products cannot overflow.
         let value_bytes = selected * u64::from(channels) * codec.dtype.size();
         let (mask, values) = (scale_bytes + mask_bytes, scale_bytes + mask_bytes + value_bytes);
         let [cells, selected, scales, mask, values] =

@@ -1,16 +1,18 @@
-//! Feature maps as bytes: how exact, which cells, packed or not.
+//! Codec of BEV feature maps: number format, selected cells, compression.
 //!
-//! The body of an encoded map, before packing, is up to three parts, each there only where the codec needs it:
+//! The body of an encoded feature map, before compression, has up to three parts, each present only if the codec needs
+//! it:
 //!
-//! | part | bytes | where |
+//! | part | bytes | present if |
 //! | --- | --- | --- |
 //! | scales, `f32` per channel | `4 C` | dtype `i8` |
 //! | mask, one bit per cell, row-major, lowest bit first | `ceil(H W / 8)` | selection top-k (by gate, budget or both) |
 //! | values `[C, K]`, `K` selected cells in row-major order | `C K` times 4, 2 or 1 | always; dense: `K = H W` |
 //!
-//! A mask of bits rather than a list of indices: it has one spelling for a set (no order, no duplicate, no index out of
-//! range to check for), and it is also the smaller of the two as soon as one cell in sixteen is sent. Channels lead in
-//! the values because a channel's cells share a scale, pack better together, and unpack into one plane of `[C, H, W]`.
+//! A bit mask rather than a list of indices: a set has one encoding (no order, no duplicates, no index out of range to
+//! check for), and the mask is also smaller as soon as one cell in sixteen is sent. Channels are the first dimension of
+//! the values because the cells of a channel share a scale, compress better together, and unpack into one plane of `[C,
+//! H, W]`.
 
 mod compression;
 mod dtype;
@@ -46,8 +48,8 @@ pub struct CodecConfig {
     /// Number format of the values.
     #[cfg_attr(feature = "config", arg(long, value_enum))]
     pub dtype: Dtype,
-    /// Confidence that a cell must exceed to be sent, smoothed by a Gaussian window first (edge and sigma in cells); a budget
-    /// chooses among those cells. Absent: as the method says, else all cells.
+    /// Confidence that a cell must exceed to be sent, smoothed by a Gaussian window first (edge and sigma in cells); a
+    /// budget selects among those cells. Absent: default of the method, else all cells.
     #[cfg_attr(
         feature = "config",
         arg(long, value_name = "THRESHOLD[,CELLS,SIGMA|,none]", allow_negative_numbers = true)
@@ -62,54 +64,54 @@ pub struct CodecConfig {
     pub zstd_level: Option<i32>,
 }
 
-/// Which cells a map brings.
+/// Selection of the cells of a feature map.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Selection {
-    /// All.
+    /// All cells.
     Dense,
-    /// Those with the highest confidence: above a threshold, as many as fit, or both.
+    /// Cells with the highest confidence: above a threshold, as many as fit, or both.
     TopK {
-        /// How many.
+        /// Number of cells.
         cells: u32,
     },
 }
 
-/// How a body is packed.
+/// Compression of a body.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Compression {
-    /// Not at all.
+    /// Not compressed.
     Raw,
-    /// One zstd frame that says how much it holds.
+    /// One zstd frame that states its content size.
     Zstd,
 }
 
-/// The codec of one message, named in its metadata.
+/// The codec of one message, stated in its metadata.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub struct Codec {
-    /// How exactly values are written.
+    /// Number format of the values.
     pub dtype: Dtype,
-    /// Which cells are there.
+    /// Selection of the cells.
     pub selection: Selection,
-    /// How the body is packed.
+    /// Compression of the body.
     pub packing: Compression,
 }
 
-/// A feature map as it crosses the air.
+/// A feature map as it is transmitted.
 #[derive(Debug, Clone, PartialEq)]
 pub struct EncodedFeatures {
-    /// The lattice.
+    /// BEV grid.
     pub grid: BevGrid,
     /// Number of channels `C`.
     pub channels: u32,
     /// As in [`BevFeatures`].
     pub code_of: Option<u32>,
-    /// What the body is.
+    /// Format of the body.
     pub codec: Codec,
-    /// Why it is that, where the message had to keep within a limit.
+    /// Reason for this format, if the message had to keep within a limit.
     pub rate: Option<RateChoice>,
-    /// The values, as the codec says.
+    /// The values, in the format of the codec.
     pub body: Body,
 }
 
@@ -118,22 +120,22 @@ pub struct EncodedFeatures {
 pub struct DecodedFeatures {
     /// `[C, H, W]`, zero where nothing was sent.
     pub features: BevFeatures,
-    /// `[H, W]`: which cells were sent; `None` where all were.
+    /// `[H, W]`: true for cells that were sent; `None` if all were.
     pub sent: Option<Vec<bool>>,
 }
 
-/// Encodes a map.
+/// Encodes a feature map.
 ///
-/// Dense `f32` without packing moves the values and copies nothing. Compression that does not make the body smaller is left
-/// out, so that a body never exceeds its budget.
+/// Dense `f32` without compression moves the values and copies nothing. Compression that does not make the body smaller
+/// is omitted, so that a body never exceeds its budget.
 ///
 /// # Shapes
 /// - `features`: `[C, H, W]`
-/// - `confidence`: `[H, W]`, needed where `config` has a gate, or a budget that not all cells fit in; ties go to the first
+/// - `confidence`: `[H, W]`, needed if `config` has a gate, or a budget that not all cells fit in; ties go to the first
 ///   cell
 ///
 /// # Errors
-/// [`WireError`] when values and lattice disagree, a value is not finite (or too large for its dtype), a gate or budget
+/// [`WireError`] when values and grid disagree, a value is not finite (or too large for its dtype), a gate or budget
 /// has no confidence map, or a budget cannot hold even an empty selection.
 pub fn encode_features(
     features: BevFeatures,
@@ -167,7 +169,7 @@ pub fn encode_features(
     encode_selected(BevFeatures { values, ..features }, codec, Some(&selected), config.zstd_level)
 }
 
-/// Writes the values of the selected cells, `[C, K]`. Dense `f32` that is not packed is checked by its receiver.
+/// Writes the values of the selected cells, `[C, K]`. Dense uncompressed `f32` is checked by its receiver.
 fn encode_selected(
     features: BevFeatures,
     codec: Codec,
@@ -192,7 +194,7 @@ fn encode_selected(
     Ok(EncodedFeatures { grid, channels, code_of, codec, rate: None, body })
 }
 
-/// Scales, mask and values one after the other.
+/// Scales, mask and values, concatenated.
 fn unpacked_body(
     grid: &BevGrid,
     channels: u32,
@@ -212,10 +214,10 @@ fn unpacked_body(
 }
 
 impl EncodedFeatures {
-    /// What the body has to be, from metadata alone.
+    /// Required shape of the body, from metadata only.
     ///
     /// # Errors
-    /// [`WireError`] when lattice, channels or selection are beyond `limits`.
+    /// [`WireError`] when grid, channels or selection exceed `limits`.
     pub(crate) fn body_shape(
         grid: &BevGrid,
         channels: u32,
@@ -226,15 +228,15 @@ impl EncodedFeatures {
         Ok(match (codec.packing, codec.dtype, codec.selection) {
             (Compression::Raw, Dtype::F32, Selection::Dense) => BodyShape::Floats((layout.values.len() / 4) as u64),
             (Compression::Raw, ..) => BodyShape::Bytes { min: layout.len() as u64, max: layout.len() as u64 },
-            // What would not get smaller is sent unpacked.
+            // A body that compression does not make smaller is sent uncompressed.
             (Compression::Zstd, ..) => BodyShape::Bytes { min: 1, max: layout.len() as u64 },
         })
     }
 
-    /// Checks the map against what its sender announced, or its receiver's network makes.
+    /// Checks the feature map against the announcement of its sender, or the output of the receiver's network.
     ///
     /// # Errors
-    /// [`WireError::Grid`] and [`WireError::Shape`] name both.
+    /// [`WireError::Grid`] and [`WireError::Shape`] state both.
     pub fn check_shape(&self, grid: &BevGrid, channels: u32, code_of: Option<u32>) -> Result<(), WireError> {
         if self.grid != *grid {
             return Err(WireError::Grid { expected: grid.to_string(), found: self.grid.to_string() });
@@ -250,10 +252,11 @@ impl EncodedFeatures {
         Ok(())
     }
 
-    /// Decodes the map. Dense `f32` moves the values; all others are converted, cells that were not sent are zero.
+    /// Decodes the feature map. Dense `f32` moves the values; all others are converted. Cells that were not sent are
+    /// zero.
     ///
     /// # Errors
-    /// [`WireError`] when sizes exceed `limits`, the body is not what shape and codec demand, or a value or scale is not
+    /// [`WireError`] when sizes exceed `limits`, the body does not match shape and codec, or a value or scale is not
     /// finite. The values of a dense `f32` body were checked when it was received.
     pub fn decode(self, limits: &Limits) -> Result<DecodedFeatures, WireError> {
         let Self { grid, channels, code_of, codec, rate: _, body } = self;
@@ -315,7 +318,7 @@ mod tests {
     }
 
     #[test]
-    fn packing_that_does_not_help_leaves_the_tensor_alone() {
+    fn compression_that_does_not_help_leaves_the_tensor_unchanged() {
         let config = CodecConfig { zstd_level: Some(3), ..CodecConfig::default() };
         let noise: Vec<f32> = (1..=8u8).map(|n| f32::from(n).sin()).collect();
         let encoded = encode_features(map(noise.clone()), &config, None).unwrap();
@@ -326,7 +329,7 @@ mod tests {
     }
 
     #[test]
-    fn a_value_that_is_none_is_never_hidden_in_a_body() {
+    fn a_value_that_is_not_finite_is_never_encoded() {
         for dtype in [Dtype::F32, Dtype::F16, Dtype::I8] {
             for (budget_bytes, zstd_level) in [(None, Some(1)), (Some(100), None), (Some(100), Some(1))] {
                 for bad in [f32::NAN, f32::INFINITY, 1e30] {
@@ -346,12 +349,12 @@ mod tests {
         let error = encode_features(map(vec![1.0; 8]), &smaller, None).unwrap_err();
         assert_eq!(error, WireError::NoConfidence { cells: 8 });
         let sparse = encode_features(map(vec![1.0; 8]), &smaller, Some(&[0.5; 8])).unwrap();
-        // One byte of mask, two a cell.
+        // One byte of mask, two bytes per cell.
         assert_eq!((sparse.codec.selection, sparse.body.len()), (Selection::TopK { cells: 7 }, 15));
     }
 
     #[test]
-    fn a_gate_sends_what_passes_and_a_budget_the_best_of_it() {
+    fn a_gate_sends_cells_that_pass_and_a_budget_the_best_of_them() {
         let confidence = [0.9, 0.1, 0.8, 0.1, 0.7, 0.1, 0.1, 0.1];
         let gate = Some(ConfidenceGate { threshold: 0.5, smoothing: None });
         let config = CodecConfig { dtype: Dtype::F16, gate, ..CodecConfig::default() };
@@ -363,8 +366,12 @@ mod tests {
         assert_eq!(decoded.sent.unwrap().iter().filter(|sent| **sent).count(), 3);
         let tight = CodecConfig { budget_bytes: Some(1 + 2 * 2), ..config };
         let encoded = encode_features(map(values.clone()), &tight, Some(&confidence)).unwrap();
-        assert_eq!(encoded.decode(&Limits::DEFAULT).unwrap().features.values[4], 0.0, "the least sure is left out");
-        // What passes fits: the budget takes nothing more.
+        assert_eq!(
+            encoded.decode(&Limits::DEFAULT).unwrap().features.values[4],
+            0.0,
+            "the least confident cell is left out"
+        );
+        // All cells that pass fit: the budget removes none.
         let wide = CodecConfig { budget_bytes: Some(15), ..config };
         let encoded = encode_features(map(values.clone()), &wide, Some(&confidence)).unwrap();
         assert_eq!(encoded.codec.selection, Selection::TopK { cells: 3 });
@@ -373,7 +380,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_worth_sending_is_an_answer_in_every_dtype() {
+    fn an_empty_selection_is_encoded_in_every_dtype() {
         let gate = Some(ConfidenceGate { threshold: 1.0, smoothing: None });
         for dtype in [Dtype::F32, Dtype::F16, Dtype::I8] {
             for zstd_level in [None, Some(1)] {
@@ -387,7 +394,7 @@ mod tests {
     }
 
     #[test]
-    fn a_gate_that_everything_passes_leaves_the_tensor_alone() {
+    fn a_gate_that_everything_passes_leaves_the_tensor_unchanged() {
         let gate = Some(ConfidenceGate { threshold: -1.0, smoothing: None });
         let config = CodecConfig { gate, ..CodecConfig::default() };
         let encoded = encode_features(map(vec![1.0; 8]), &config, Some(&[0.0; 8])).unwrap();
@@ -395,7 +402,7 @@ mod tests {
     }
 
     #[test]
-    fn a_map_must_fill_its_lattice() {
+    fn a_map_must_fill_its_grid() {
         let features = BevFeatures { grid: GRID, channels: 2, code_of: None, values: vec![0.0; 8] };
         let error = encode_features(features, &CodecConfig::default(), None).unwrap_err();
         assert_eq!(error, WireError::Shape { what: "features", expected: 16, found: 8 });

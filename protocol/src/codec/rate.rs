@@ -1,7 +1,7 @@
-//! Fitting a map to what the air takes: in how exact numbers, and how many of its cells.
+//! Rate control of feature maps: fits a map into a byte limit by number format, then by number of cells.
 //!
-//! Numbers get coarser before cells are left out: a byte per value costs next to no accuracy, a cell that is missing is
-//! missing. Which cells stay is decided by the map's own confidence, as everywhere.
+//! Number formats get coarser before cells are left out: one byte per value costs next to no accuracy, a missing cell
+//! is lost. The map's own confidence decides which cells are sent.
 
 use serde::{Deserialize, Serialize};
 
@@ -11,63 +11,63 @@ use crate::Limits;
 use crate::WireError;
 use crate::string_enum::named;
 
-/// Bytes of a message with a map that are kept free for header and metadata.
+/// Bytes of a message with a feature map that are reserved for header and metadata.
 pub const HEAD_BYTES: u64 = 256;
-/// From the most exact to the coarsest.
+/// From the most precise to the coarsest.
 const DTYPES_BY_PRECISION: [Dtype; 3] = [Dtype::F32, Dtype::F16, Dtype::I8];
-/// Largest absolute value that half precision holds.
+/// Largest finite absolute value of half precision.
 const F16_MAX: f32 = 65_504.0;
 
-/// What keeps a message small.
+/// Origin of a byte limit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum LimitedBy {
-    /// A size that no message may exceed.
+    /// Maximum size of any message.
     MessageSize,
     /// Bytes per second.
     ByteRate,
-    /// The sender's own queue: what was offered before has not left yet.
+    /// The sender's own queue: earlier messages have not left yet.
     Queue,
 }
 
-/// The most that a message may take, header and metadata included.
+/// Maximum size of a message, header and metadata included.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ByteLimit {
-    /// Bytes.
+    /// Maximum size, bytes.
     pub bytes: u64,
-    /// Where the limit comes from.
+    /// Origin of the limit.
     pub by: LimitedBy,
 }
 
 named! {
-    /// Why a map that had to keep within a limit is written as it is.
+    /// Reason for the format of a feature map that had to keep within a limit.
     pub enum RateReason {
-        /// It fits as it is wanted.
+        /// The map fits in the configured format.
         Fits = "fits",
-        /// All cells fit the size of a message, in coarser numbers.
+        /// All cells fit the maximum size of a message, in a coarser format.
         SizeCoarser = "size_coarser",
-        /// Not all cells fit the size of a message.
+        /// Not all cells fit the maximum size of a message.
         SizeFewerCells = "size_fewer_cells",
-        /// All cells fit the byte rate, in coarser numbers.
+        /// All cells fit the byte rate, in a coarser format.
         RateCoarser = "rate_coarser",
         /// Not all cells fit the byte rate.
         RateFewerCells = "rate_fewer_cells",
-        /// All cells fit what the queue lets through, in coarser numbers.
+        /// All cells fit the limit of the queue, in a coarser format.
         QueueCoarser = "queue_coarser",
-        /// Not all cells fit what the queue lets through.
+        /// Not all cells fit the limit of the queue.
         QueueFewerCells = "queue_fewer_cells",
     }
 }
 
-/// Why a map is written as it is: in the metadata of its message, beside the codec that says how.
+/// Reason for the format of a feature map: in the metadata of its message, beside the codec.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub struct RateChoice {
-    /// Why.
+    /// Reason for the chosen codec.
     pub reason: RateReason,
-    /// Most bytes that the message was allowed, header and metadata included.
+    /// Limit of the message, bytes, header and metadata included.
     pub limit_bytes: u64,
 }
 
-/// What had to give.
+/// Reduction that the limit required.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum ReducedBy {
     Nothing,
@@ -75,17 +75,17 @@ enum ReducedBy {
     Cells,
 }
 
-/// Encodes a map so that its whole message keeps within `limit`: in the numbers that `config` wants if all cells that its
-/// gate passes fit, else in coarser ones, else in the coarsest with as many cells as fit, the most confident first. The
-/// same map, confidence and limit give the same bytes.
+/// Encodes a feature map so that its whole message keeps within `limit`: in the configured format if all cells that
+/// pass the gate fit, else in a coarser one, else in the coarsest with as many cells as fit, the most confident first.
+/// The same map, confidence and limit give the same bytes.
 ///
-/// With packing a message is smaller still: what zstd saves is not known before.
+/// With compression a message is smaller still: the gain of zstd is not known in advance.
 ///
 /// # Shapes
-/// As [`encode_features`]; `confidence` is needed wherever not all cells fit.
+/// As [`encode_features`]; `confidence` is needed if not all cells fit.
 ///
 /// # Errors
-/// As [`encode_features`]; [`WireError::Budget`] where not even an empty selection fits.
+/// As [`encode_features`]; [`WireError::Budget`] if not even an empty selection fits.
 pub fn encode_within(
     features: BevFeatures,
     config: &CodecConfig,
@@ -93,22 +93,22 @@ pub fn encode_within(
     confidence: Option<&[f32]>,
 ) -> Result<EncodedFeatures, WireError> {
     let budget = limit.bytes.saturating_sub(HEAD_BYTES).min(config.budget_bytes.unwrap_or(u64::MAX));
-    let (dtype, gave) = choose(&features, config, budget, confidence)?;
+    let (dtype, reduced_by) = choose(&features, config, budget, confidence)?;
     let config = CodecConfig { dtype, budget_bytes: Some(budget), ..*config };
     let encoded = encode_features(features, &config, confidence)?;
-    let rate = Some(RateChoice { reason: reason(limit.by, gave), limit_bytes: limit.bytes });
+    let rate = Some(RateChoice { reason: reason(limit.by, reduced_by), limit_bytes: limit.bytes });
     Ok(EncodedFeatures { rate, ..encoded })
 }
 
-/// Bytes that a message with a map may take as `config` wants it, all cells sent: what a limit has to be to be none.
+/// Maximum size, bytes, of a message with all cells in the configured format: a limit of this size has no effect.
 ///
 /// # Errors
-/// [`WireError`] when the map is beyond what may be sent.
+/// [`WireError`] when the map exceeds the sender's limits.
 pub fn largest_message(features: &BevFeatures, config: &CodecConfig) -> Result<u64, WireError> {
     Ok(HEAD_BYTES + body_bytes(features, config.dtype, Selection::Dense)?)
 }
 
-/// Fewest bytes that a message takes in which a map of this shape brings nothing but its lattice.
+/// Minimum size, bytes, of a message with a feature map of this shape: an empty selection.
 ///
 /// # Errors
 /// As [`largest_message`].
@@ -116,7 +116,7 @@ pub fn smallest_message(features: &BevFeatures) -> Result<u64, WireError> {
     Ok(HEAD_BYTES + body_bytes(features, Dtype::I8, Selection::TopK { cells: 0 })?)
 }
 
-/// The most exact numbers in which all wanted cells fit, or the coarsest.
+/// The most precise format in which all wanted cells fit, or the coarsest.
 fn choose(
     features: &BevFeatures,
     config: &CodecConfig,
@@ -129,19 +129,19 @@ fn choose(
         if body_bytes(features, dtype, wanted)? > budget {
             continue;
         }
-        let gave = if dtype == config.dtype { ReducedBy::Nothing } else { ReducedBy::Exactness };
-        // Asked last: half precision that overflows is rare, and looking for it takes time.
-        if gave == ReducedBy::Nothing
+        let reduced_by = if dtype == config.dtype { ReducedBy::Nothing } else { ReducedBy::Exactness };
+        // Tested last: an overflow of half precision is rare, and the search for it takes time.
+        if reduced_by == ReducedBy::Nothing
             || dtype != Dtype::F16
             || features.values.iter().all(|value| value.abs() <= F16_MAX)
         {
-            return Ok((dtype, gave));
+            return Ok((dtype, reduced_by));
         }
     }
     Ok((Dtype::I8, ReducedBy::Cells))
 }
 
-/// What would be sent without a limit.
+/// Selection without a limit.
 fn wanted(features: &BevFeatures, config: &CodecConfig, confidence: Option<&[f32]>) -> Result<Selection, WireError> {
     let (Some(gate), Some(confidence)) = (config.gate, confidence) else { return Ok(Selection::Dense) };
     let cells = features.grid.cells();
@@ -155,8 +155,8 @@ fn body_bytes(features: &BevFeatures, dtype: Dtype, selection: Selection) -> Res
     Ok(Layout::new(&features.grid, features.channels, &codec, &Limits::SENDER)?.len() as u64)
 }
 
-fn reason(by: LimitedBy, gave: ReducedBy) -> RateReason {
-    match (by, gave) {
+fn reason(by: LimitedBy, reduced_by: ReducedBy) -> RateReason {
+    match (by, reduced_by) {
         (_, ReducedBy::Nothing) => RateReason::Fits,
         (LimitedBy::MessageSize, ReducedBy::Exactness) => RateReason::SizeCoarser,
         (LimitedBy::MessageSize, ReducedBy::Cells) => RateReason::SizeFewerCells,
@@ -202,7 +202,7 @@ mod tests {
     }
 
     #[test]
-    fn numbers_get_coarser_before_cells_are_left_out() {
+    fn formats_get_coarser_before_cells_are_left_out() {
         // 192 cells of 8 channels: 6,144 bytes, 3,072, and 1,536 with 32 of scales.
         let choice = |bytes| {
             let encoded = encode(&CodecConfig::default(), HEAD_BYTES + bytes).unwrap();
@@ -211,7 +211,7 @@ mod tests {
         assert_eq!(choice(6144), (Dtype::F32, Selection::Dense, RateReason::Fits));
         assert_eq!(choice(6143), (Dtype::F16, Selection::Dense, RateReason::SizeCoarser));
         assert_eq!(choice(3071), (Dtype::I8, Selection::Dense, RateReason::SizeCoarser));
-        // 24 bytes of mask and 8 a cell.
+        // 24 bytes of mask and 8 per cell.
         let fewer = Selection::TopK { cells: (1567 - 32 - 24) / 8 };
         assert_eq!(choice(1567), (Dtype::I8, fewer, RateReason::SizeFewerCells));
     }
@@ -227,7 +227,7 @@ mod tests {
     }
 
     #[test]
-    fn a_gate_leaves_room_for_exact_numbers() {
+    fn a_gate_leaves_room_for_a_precise_format() {
         let gate = Some(ConfidenceGate { threshold: 0.9, smoothing: None });
         let config = CodecConfig { gate, ..CodecConfig::default() };
         let encoded = encode(&config, HEAD_BYTES + 1000).unwrap();
@@ -236,7 +236,7 @@ mod tests {
     }
 
     #[test]
-    fn what_half_precision_cannot_hold_is_written_in_bytes() {
+    fn values_beyond_half_precision_are_written_as_i8() {
         let (mut features, confidence) = map();
         features.values[5] = 1e5;
         let limit = ByteLimit { bytes: HEAD_BYTES + 4000, by: LimitedBy::ByteRate };

@@ -1,12 +1,12 @@
-//! Which cells of a map are sent.
+//! Selection of the cells of a feature map that are sent: budget, mask, gather and scatter.
 
 use super::Dtype;
 use crate::WireError;
 
-/// Checks that there is one finite confidence for each cell.
+/// Checks that there is one finite confidence per cell.
 ///
 /// # Errors
-/// [`WireError`] names the first that is none, or both counts.
+/// [`WireError`] states the first that is not finite, or both counts.
 pub(super) fn check_confidence(confidence: &[f32], cells: usize) -> Result<(), WireError> {
     if confidence.len() != cells {
         let (expected, found) = (cells as u64, confidence.len() as u64);
@@ -19,7 +19,7 @@ pub(super) fn check_confidence(confidence: &[f32], cells: usize) -> Result<(), W
     Ok(())
 }
 
-/// Of the `candidates` (`None`: of all cells) those with the highest confidence that fit into `budget` bytes, in
+/// The cells with the highest confidence that fit into `budget` bytes, among `candidates` (`None`: all cells), in
 /// row-major order.
 ///
 /// # Errors
@@ -35,12 +35,12 @@ pub(super) fn within_budget(
     let needed = scale_bytes + confidence.len().div_ceil(8) as u64;
     let for_cells = budget.checked_sub(needed).ok_or(WireError::Budget { budget, needed })?;
     let fitting = usize::try_from(for_cells / (u64::from(channels) * dtype.size())).unwrap_or(usize::MAX);
-    // A lattice has at most 2^32 - 1 cells.
+    // A grid has at most 2^32 - 1 cells.
     let candidates = candidates.map_or_else(|| (0..confidence.len() as u32).collect(), <[u32]>::to_vec);
     Ok(most_confident(confidence, candidates, fitting))
 }
 
-/// The `count` most confident of some cells in row-major order; of equals, the first.
+/// The `count` most confident cells, in row-major order; ties go to the first.
 fn most_confident(confidence: &[f32], mut cells: Vec<u32>, count: usize) -> Vec<u32> {
     if count < cells.len() {
         let descending = |a: &u32, b: &u32| confidence[*b as usize].total_cmp(&confidence[*a as usize]).then(a.cmp(b));
@@ -72,7 +72,8 @@ pub(super) fn append_mask(bytes: &mut Vec<u8>, cells: usize, selected: &[u32]) {
 /// The selected cells in row-major order.
 ///
 /// # Errors
-/// [`WireError::Shape`] when the mask selects another number of cells than announced, or any beyond the last.
+/// [`WireError::Shape`] when the number of cells in the mask differs from the announced one, or a cell is beyond the
+/// last.
 pub(super) fn read_mask(mask: &[u8], cells: usize, announced: usize) -> Result<Vec<u32>, WireError> {
     let found: u64 = mask.iter().map(|byte| u64::from(byte.count_ones())).sum();
     if found != announced as u64 {
@@ -90,7 +91,7 @@ pub(super) fn read_mask(mask: &[u8], cells: usize, announced: usize) -> Result<V
     }
 }
 
-/// The map `[C, H W]` with zeros where nothing was sent, and which cells were.
+/// The feature map `[C, H, W]` with zeros for cells that were not sent, and the flags of the cells that were.
 pub(super) fn scatter(values: &[f32], channels: usize, cells: usize, selected: &[u32]) -> (Vec<f32>, Vec<bool>) {
     let mut map = vec![0f32; channels * cells];
     let mut sent = vec![false; cells];
@@ -125,7 +126,7 @@ mod tests {
     #[test]
     fn the_budget_is_filled_and_kept() {
         let confidence: Vec<f32> = (0..100u8).map(f32::from).collect();
-        // Scales 4 * 3, mask 13, then 3 bytes a cell.
+        // Scales 4 * 3, mask 13, then 3 bytes per cell.
         let selected = within_budget(&confidence, None, 3, Dtype::I8, 12 + 13 + 3 * 5 + 2).unwrap();
         assert_eq!(selected, [95, 96, 97, 98, 99]);
         let error = within_budget(&confidence, None, 3, Dtype::I8, 24).unwrap_err();
@@ -136,7 +137,7 @@ mod tests {
     }
 
     #[test]
-    fn a_mask_that_lies_is_refused() {
+    fn a_mask_that_contradicts_the_metadata_is_refused() {
         let mut mask = Vec::new();
         append_mask(&mut mask, 12, &[0, 9, 11]);
         assert_eq!(mask, [0b0000_0001, 0b0000_1010]);

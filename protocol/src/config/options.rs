@@ -44,8 +44,8 @@ pub fn options_of<A: Args>() -> impl Iterator<Item = Arg> {
     command.get_arguments().cloned().collect::<Vec<_>>().into_iter()
 }
 
-/// Appends its default to the help of each of `options`, and lets flags be switched off (`--flag=false`), so that they can
-/// change what a file says.
+/// Appends its default to the help of each of `options`, and lets flags be switched off (`--flag=false`), so that they
+/// can override a file.
 pub fn document(command: Command, options: impl Iterator<Item = Arg>, defaults: &Value) -> Command {
     let defaults = names(defaults);
     options.fold(command, |command, option| {
@@ -99,7 +99,7 @@ fn collect(value: &Value, path: &mut Vec<String>, leaves: &mut Vec<(Vec<String>,
     }
 }
 
-/// A default as it is typed; nothing where there is none, or it goes without saying.
+/// A default in the form in which it is typed; `None` if there is no default, or if it is empty or false.
 fn text(value: &Value) -> Option<String> {
     match value {
         Value::Null | Value::Bool(false) | Value::Object(_) => None,

@@ -1,4 +1,4 @@
-//! A feature map with everything needed to use it.
+//! BEV feature map of an agent, with pose, grid and codec.
 
 use serde::{Deserialize, Serialize};
 
@@ -15,29 +15,29 @@ use crate::WireError;
 
 /// A BEV feature map: agent to ego, for intermediate fusion.
 ///
-/// Body: the map as its codec says, see [`crate::codec`].
+/// Body: the map in the format of its codec, see [`crate::codec`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct Bev {
-    /// Where the sender is: repeated from its `pose` message, so that each is complete alone.
+    /// Pose of the sender: repeated from its `pose` message, so that each message is self-contained.
     pub pose: PoseEstimate,
-    /// The map, in the frame of the sender's LiDAR.
+    /// The feature map, in the frame of the sender's LiDAR.
     pub features: EncodedFeatures,
 }
 
 /// Metadata of [`Bev`].
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct BevMetadata {
-    /// Where the sender is.
+    /// Pose of the sender.
     pub pose: PoseEstimate,
-    /// Lattice of the map.
+    /// BEV grid of the map.
     pub grid: BevGrid,
     /// Channels of the map.
     pub channels: u32,
-    /// Channels of the map that these are the code of, where a learnt compressor has squeezed them.
+    /// Channels of the map before a learnt compressor, if one was used.
     pub code_of: Option<u32>,
-    /// What the body is.
+    /// Format of the body.
     pub codec: Codec,
-    /// Why it is that, where the message had to keep within a limit.
+    /// Reason for this format, if the message had to keep within a limit.
     pub rate: Option<RateChoice>,
 }
 
@@ -64,7 +64,7 @@ impl Payload for Bev {
     }
 }
 
-/// A code has no more channels than the map that it stands for, and that has no more than are taken.
+/// A code has no more channels than the map that it encodes, and the map no more than permitted.
 fn check_code(channels: u32, code_of: Option<u32>, limits: &Limits) -> Result<(), WireError> {
     let Some(widened) = code_of else { return Ok(()) };
     if widened > limits.max_channels {

@@ -1,4 +1,4 @@
-//! What one agent detects alone.
+//! Detections of one agent from its own sensors.
 
 use serde::{Deserialize, Serialize};
 
@@ -10,9 +10,9 @@ use crate::WireError;
 /// Detections of one agent: agent to ego, for late fusion.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Boxes {
-    /// Where the sender is.
+    /// Pose of the sender.
     pub pose: PoseEstimate,
-    /// What it sees, in the frame of its own LiDAR.
+    /// Detections in the frame of the sender's LiDAR.
     pub detections: Vec<Detection>,
 }
 

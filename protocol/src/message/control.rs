@@ -1,4 +1,4 @@
-//! How a run is steered, and how its processes agree to begin.
+//! Control messages: clock of a run, and the start barrier of its processes.
 
 use serde::{Deserialize, Serialize};
 
@@ -9,65 +9,66 @@ use crate::Topic;
 use crate::Verb;
 use crate::WireError;
 
-/// One request or notice; [`Control::verb`] names the key it goes to.
+/// One request or notification; [`Control::verb`] gives its key.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Control {
-    /// Operator to replay: let the scene's clock run from here.
+    /// Operator to replay: start the scene's clock from here.
     Start {
-        /// Seconds of the scene per second; 0: as fast as the fleet can.
+        /// Seconds of the scene per second; 0: as fast as possible.
         rate: f64,
     },
     /// Operator to replay: halt after the current tick.
     Pause,
-    /// Operator to replay: run on.
+    /// Operator to replay: continue.
     Resume,
-    /// Operator to replay: publish so many ticks, then halt.
+    /// Operator to replay: publish a number of ticks, then halt.
     Step {
-        /// How many.
+        /// Number of ticks.
         ticks: u64,
     },
-    /// Operator to replay: go on from this tick.
+    /// Operator to replay: continue from this tick.
     Seek {
-        /// Which, counted from 0.
+        /// Index of the tick, from 0.
         tick: u64,
     },
-    /// Replay to all: nothing more will come.
+    /// Replay to all: no more messages follow.
     End {
         /// Ticks published, over all loops.
         ticks: u64,
-        /// What was published, so that each receiver can tell what it lacks.
+        /// Messages published by topic, so that each receiver can compute its losses.
         sent: Vec<TopicCount>,
     },
-    /// Any process, on a key of its own: models are loaded, subscriptions stand.
+    /// Any process, on a key of its own: models are loaded, subscriptions are declared.
     Ready {
-        /// Who.
+        /// Process that is ready.
         process: ProcessId,
-        /// Routes over which a [`Control::Probe`] has come.
+        /// Routes over which a [`Control::Probe`] has arrived.
         heard: Vec<Topic>,
     },
-    /// On a data key before the first message: proves the route. Answered by [`Control::Ready`] that names the topic.
+    /// On a data key before the first message: confirms the route. Answered by [`Control::Ready`] with the topic.
     Probe,
-    /// Any process to replay, stepped runs: everything of this tick is done.
+    /// Any process to replay, stepped runs: all work of this tick is done.
     Done {
-        /// Who.
+        /// Process that is done.
         process: ProcessId,
-        /// Which tick, counted from 0.
+        /// Index of the tick, from 0.
         tick: u64,
     },
 }
 
-/// How many messages went out on a topic.
+/// Number of messages published on a topic.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct TopicCount {
-    /// Where.
+    /// Topic of the messages.
     pub topic: Topic,
-    /// How many.
+    /// Number of messages.
     pub messages: u64,
 }
 
 impl Control {
-    /// The control key this goes to; a probe goes to the data key it proves, its answer to `ready/<process>`.
+    /// The control key of this message; a probe is published on the data key that it confirms, its answer on
+    /// `ready/<process>`.
     #[must_use]
     pub fn verb(&self) -> Option<Verb> {
         Some(match self {

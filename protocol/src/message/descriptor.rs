@@ -1,4 +1,4 @@
-//! What an agent is going to send.
+//! Descriptor of an agent: model, grid and streams.
 
 use std::fmt;
 use std::str::FromStr;
@@ -13,20 +13,20 @@ use crate::Stream;
 use crate::WireError;
 use crate::string_enum::written_as_text;
 
-/// What an agent is and sends: agent to ego, once it is ready and to every late joiner.
+/// Model and streams of an agent: agent to ego, once it is ready and to every late joiner.
 ///
-/// An ego can tell from it whether a neighbour's features are its own network's, before any of them comes.
+/// An ego compares it with its own network before any feature map arrives.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Descriptor {
     /// Hash of the weights its features come from.
     pub model_hash: ModelHash,
-    /// Lattice of its maps.
+    /// BEV grid of its feature maps.
     pub grid: BevGrid,
-    /// Channels of its maps.
+    /// Channels of its feature maps.
     pub channels: u32,
-    /// How exactly it writes them.
+    /// Number format of its feature maps.
     pub dtype: Dtype,
-    /// What it publishes.
+    /// Streams that it publishes.
     pub streams: Vec<Stream>,
 }
 

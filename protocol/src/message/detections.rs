@@ -1,4 +1,4 @@
-//! What the ego detected, and from whose data.
+//! Detections of an ego, with the neighbours that contributed.
 
 use serde::{Deserialize, Serialize};
 
@@ -16,64 +16,64 @@ use crate::WireError;
 /// The result of one ego frame: ego-fuser to anyone, also as JSON.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Detections {
-    /// The vehicle that fused, whose LiDAR frame the boxes are in.
+    /// The vehicle that fused; the boxes are in its LiDAR frame.
     pub ego: CavId,
-    /// Frame of the ego's own agent, counted from 0: the sequence of the agent's message that the frame began with; in
-    /// virtual time, where every sweep is taken, ticks since the first. A number left out is a frame that was never
-    /// decided. The same moment has the same capture time everywhere, but no vehicle knows the scene's tick.
+    /// Frame of the ego's own agent, counted from 0: the sequence of the agent's message with which the frame began; in
+    /// simulation time, where every sweep is used, ticks since the first. A missing number is a frame for which no
+    /// result was computed. One capture time is the same in all vehicles, but no vehicle has the tick of the scene.
     pub agent_frame: u64,
     /// Fusion method, as in the configuration.
     pub method: String,
-    /// Where the ego believes to be.
+    /// Pose estimate of the ego.
     pub pose: PoseEstimate,
-    /// What it detects, best first.
+    /// Detections, by descending score.
     pub detections: Vec<Detection>,
-    /// Whose data were fused, the ego not counted.
+    /// Neighbours whose data were fused, without the ego.
     pub fused: Vec<FusedNeighbour>,
-    /// Whose data could not be.
+    /// Neighbours whose data were not fused.
     pub skipped: Vec<SkippedNeighbour>,
-    /// What the ego makes of the neighbours that it heard for this frame.
+    /// Misbehaviour detection and clock offset of each neighbour that sent data for this frame.
     pub heard: Vec<HeardNeighbour>,
-    /// How long each stage took.
+    /// Durations of the stages.
     pub stages: Vec<StageTiming>,
 }
 
 /// A neighbour whose data are in a result.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct FusedNeighbour {
-    /// Who.
+    /// Id of the neighbour.
     pub cav: CavId,
-    /// Capture time of the ego's sweep less that of the neighbour's, nanoseconds; negative where the neighbour's is the
-    /// younger.
+    /// Capture time of the ego's sweep minus that of the neighbour's, nanoseconds; negative if the neighbour's is
+    /// newer.
     pub age_nanos: i64,
-    /// How sure the neighbour is of its pose, 0..=1.
+    /// Confidence of the neighbour's pose, 0..=1.
     pub confidence: f32,
-    /// Bytes of metadata and body of the message that was fused: map, boxes or points as they crossed the air.
+    /// Bytes of metadata and body of the message that was fused: feature map, boxes or points as transmitted.
     pub payload_bytes: u64,
-    /// Bytes of everything it sent for this frame, headers and the pose's own message included.
+    /// Bytes of all its messages for this frame, headers and the pose message included.
     pub wire_bytes: u64,
 }
 
 /// A neighbour that is known but not in a result.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct SkippedNeighbour {
-    /// Who.
+    /// Id of the neighbour.
     pub cav: CavId,
-    /// Why; `None`: nothing has come from it for this frame.
+    /// Drop reason; `None`: nothing has arrived from it for this frame.
     pub reason: Option<DropReason>,
 }
 
-/// A neighbour as the ego knows it.
+/// State of a neighbour at the ego.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct HeardNeighbour {
-    /// Who.
+    /// Id of the neighbour.
     pub cav: CavId,
-    /// How likely it is honest, 0..=1; `None` where the ego does not ask.
+    /// Trust score (probability of being honest), 0..=1; `None` without misbehaviour detection.
     pub trust: Option<f64>,
-    /// Why it is left out, where it is not believed.
+    /// Misbehaviour reason, if it is excluded.
     pub doubt: Option<MisbehaviourReason>,
-    /// Its clock less the ego's, less the shortest time a message of it was under way, seconds; `None` where there is but
-    /// one clock.
+    /// Its clock minus the ego's, minus the shortest transit time of its messages, seconds; `None` if both share one
+    /// clock.
     pub clock_offset_s: Option<f64>,
 }
 
@@ -91,7 +91,7 @@ impl Detections {
         check_count("heard neighbours", self.heard.len(), limits.max_entries)?;
         for neighbour in &self.heard {
             check_within("trust", neighbour.trust.unwrap_or(0.0), 0.0, 1.0)?;
-            // Whoever lies about the time may be off by all of it.
+            // The clock of an attacker may be wrong by any amount.
             check_within("clock offset", neighbour.clock_offset_s.unwrap_or(0.0), -1e11, 1e11)?;
         }
         StageTiming::check_all(&self.stages, limits)
@@ -100,11 +100,11 @@ impl Detections {
 
 metadata_only!(Detections, Detections);
 
-/// [`Detections`] together with who, which and when, as written to `detections/json` and `detections.jsonl`: one flat
+/// [`Detections`] with the fields of its [`Stamp`], as written to `detections/json` and `detections.jsonl`: one flat
 /// JSON object.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct DetectionsReport {
-    /// Tick of the scene, counted from 0, where the writer knows it: the scorer does, the ego does not.
+    /// Tick of the scene, counted from 0, if known: the scorer knows it, the ego does not.
     pub tick: Option<u64>,
     /// See [`Stamp::epoch`].
     pub epoch: u64,
@@ -120,7 +120,7 @@ pub struct DetectionsReport {
 }
 
 impl DetectionsReport {
-    /// The result of `stamp`'s frame, at a tick of the scene where that is known.
+    /// The result of `stamp`'s frame, at a tick of the scene if that is known.
     #[must_use]
     pub fn new(stamp: &Stamp, tick: Option<u64>, result: Detections) -> Self {
         let Stamp { cav: _, epoch, sequence, capture_nanos, publish_nanos } = *stamp;
@@ -130,7 +130,8 @@ impl DetectionsReport {
     /// As JSON, on one line.
     #[must_use]
     pub fn to_json(&self) -> String {
-        // Neither a map with keys that are no strings nor a failing `Serialize` is in here: the only errors there are.
+        // Serialisation fails only for maps with keys that are not strings or a failing `Serialize`; neither occurs
+        // here.
         serde_json::to_string(self).unwrap_or_default()
     }
 }

@@ -1,4 +1,4 @@
-//! Poses from outside the method: recorded ones, and a receiver's.
+//! Poses that are not computed by the method: recorded ones, and those of a GNSS receiver.
 
 use serde::{Deserialize, Serialize};
 
@@ -12,19 +12,19 @@ use crate::WireError;
 pub struct Gnss {
     /// Pose of the LiDAR.
     pub world_from_lidar: Pose,
-    /// Standard deviation of each coordinate, metres; 0 where the source claims to be exact.
+    /// Standard deviation of each coordinate, metres; 0 for an exact source.
     pub position_std_m: f64,
     /// Standard deviation of the heading, radians.
     pub heading_std_rad: f64,
-    /// Where the pose comes from.
+    /// Origin of the pose.
     pub source: GnssSource,
 }
 
-/// Where a recorded pose comes from.
+/// Origin of a recorded pose.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum GnssSource {
-    /// The data set's own pose, as good as it has.
+    /// The data set's own pose.
     Recorded,
     /// A satellite receiver, with its noise.
     Gnss,

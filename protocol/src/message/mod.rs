@@ -1,8 +1,7 @@
 //! The messages: one struct of public fields per kind.
 //!
-//! What is small stands in the metadata, what is large in the body. Metadata are checked when they are decoded and, by the
-//! same rules, when they are encoded, so that a mistake shows where it was made; bodies are checked by those who receive
-//! them.
+//! Small fields are in the metadata, large ones in the body. Metadata are checked when they are decoded and, by the
+//! same rules, when they are encoded, so that an error is reported at its origin; bodies are checked by receivers.
 
 mod bev;
 mod boxes;
@@ -13,6 +12,7 @@ mod gnss;
 mod pose_estimate;
 mod stats;
 mod sweep;
+mod table;
 mod truth;
 
 use serde::Serialize;
@@ -20,7 +20,6 @@ use serde::de::DeserializeOwned;
 
 use crate::Body;
 use crate::BodyShape;
-use crate::Kind;
 use crate::Limits;
 use crate::Pose;
 use crate::WireError;
@@ -34,25 +33,27 @@ pub use gnss::{Gnss, GnssSource};
 pub use pose_estimate::{NoPoseReason, PoseEstimate};
 pub use stats::{StageSummary, StageTiming, Stats};
 pub use sweep::{Lidar, Points, PointsMetadata, Radar, SweepMetadata};
+pub use table::{Kind, Message};
+pub(crate) use table::{MessageSource, MessageVisitor};
 pub use truth::{AgentTruth, TrueObject, Truth};
 
-/// A struct that is one kind of message. Only this crate's messages are.
+/// One kind of message. Implemented by messages of this crate only.
 pub trait Payload: Sized + private::Sealed {
-    /// The kind that names it on the wire.
+    /// The kind on the wire.
     const KIND: Kind;
-    /// What of it stands in the metadata.
+    /// Fields in the metadata.
     type Metadata: Serialize + DeserializeOwned;
 
-    /// Takes the message apart, copying nothing large.
+    /// Splits the message into metadata and body, copying nothing large.
     fn into_parts(self) -> (Self::Metadata, Body);
 
-    /// Checks all values of the metadata and says what the body has to be.
+    /// Checks all values of the metadata and returns the required shape of the body.
     ///
     /// # Errors
-    /// [`WireError`] names the field and its bounds.
+    /// [`WireError`] states the field and its bounds.
     fn check(metadata: &Self::Metadata, limits: &Limits) -> Result<BodyShape, WireError>;
 
-    /// Puts checked metadata and a body of the shape they ask for together.
+    /// Assembles a message from checked metadata and a body of the required shape.
     ///
     /// # Errors
     /// [`WireError::Shape`] when the body is of another type.
@@ -61,67 +62,6 @@ pub trait Payload: Sized + private::Sealed {
 
 mod private {
     pub trait Sealed {}
-}
-
-/// A message of any kind, for those who handle all: recorder, link, tests.
-#[derive(Debug, Clone, PartialEq)]
-pub enum Message {
-    /// A LiDAR sweep.
-    Lidar(Lidar),
-    /// A radar sweep.
-    Radar(Radar),
-    /// A recorded or GNSS pose.
-    Gnss(Gnss),
-    /// A pose estimate.
-    Pose(PoseEstimate),
-    /// A BEV feature map.
-    Bev(Bev),
-    /// Detections of one agent.
-    Boxes(Boxes),
-    /// Points of one agent.
-    Points(Points),
-    /// What an agent is going to send.
-    Descriptor(Descriptor),
-    /// What the ego detected.
-    Detections(Detections),
-    /// True poses and objects.
-    Truth(Truth),
-    /// Start, stop, readiness.
-    Control(Control),
-    /// Ledger and timings of a process.
-    Stats(Stats),
-}
-
-/// RunScope `$body` with `$message` bound to the message inside, whatever its kind.
-macro_rules! for_message {
-    ($any:expr, $message:ident => $body:expr) => {
-        match $any {
-            Message::Lidar($message) => $body,
-            Message::Radar($message) => $body,
-            Message::Gnss($message) => $body,
-            Message::Pose($message) => $body,
-            Message::Bev($message) => $body,
-            Message::Boxes($message) => $body,
-            Message::Points($message) => $body,
-            Message::Descriptor($message) => $body,
-            Message::Detections($message) => $body,
-            Message::Truth($message) => $body,
-            Message::Control($message) => $body,
-            Message::Stats($message) => $body,
-        }
-    };
-}
-pub(crate) use for_message;
-
-impl Message {
-    /// What kind it is.
-    #[must_use]
-    pub fn kind(&self) -> Kind {
-        fn kind_of<M: Payload>(_: &M) -> Kind {
-            M::KIND
-        }
-        for_message!(self, message => kind_of(message))
-    }
 }
 
 /// Implements [`Payload`] for messages that are metadata only; `check` is their own method.
@@ -163,7 +103,7 @@ fn check_pose(what: &'static str, pose: &Pose) -> Result<(), WireError> {
     pose.validate().map_err(|source| WireError::Pose { what, source })
 }
 
-/// Names inside metadata: stages, classes.
+/// Checks names in metadata: stages, classes.
 fn check_name(what: &'static str, name: &str) -> Result<(), WireError> {
     check_count(what, name.len(), 64)
 }
@@ -178,7 +118,7 @@ fn wrong_body(shape: BodyShape, body: &Body) -> WireError {
     WireError::Shape { what: "body bytes", expected, found: body.len() as u64 }
 }
 
-/// The longest time a process takes for anything, in the eyes of a receiver: one day.
+/// Maximum duration that a receiver accepts, nanoseconds: one day.
 const MAX_NANOS: u64 = 86_400_000_000_000;
 
 fn check_nanos(what: &'static str, nanos: u64) -> Result<(), WireError> {

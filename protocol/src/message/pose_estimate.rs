@@ -1,4 +1,4 @@
-//! Where an agent believes to be.
+//! Pose estimate of an agent, or the reason why it has none.
 
 use serde::{Deserialize, Serialize};
 
@@ -7,40 +7,40 @@ use crate::Limits;
 use crate::Pose;
 use crate::WireError;
 
-/// An agent's own pose, or why it has none: agent to ego, alone as soon as it is known and again inside everything
-/// that needs it.
+/// Pose estimate of an agent, or the reason why it has none: agent to ego, on its own as soon as it is known, and again
+/// in every message that needs it.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum PoseEstimate {
-    /// The agent knows where it is.
+    /// A pose was found.
     Pose {
         /// Pose of its LiDAR.
         world_from_cav: Pose,
-        /// How sure it is, sigma of the method, 0..=1.
+        /// Confidence of the pose (sigma of the method), 0..=1.
         confidence: f32,
     },
-    /// It does not know, and says so rather than making a pose up.
+    /// No pose was found.
     NoPose {
-        /// Why.
+        /// Reason for the missing pose.
         reason: NoPoseReason,
-        /// Correspondences that agreed, where any were sought.
+        /// Number of inliers, if correspondences were searched.
         inlier_count: u32,
     },
 }
 
-/// Why an agent has no pose.
+/// Reason why an agent has no pose.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum NoPoseReason {
-    /// The sweep has too few points to localise with.
+    /// The sweep has too few points.
     TooFewPoints,
-    /// Too few correspondences agree on one pose.
+    /// Too few inliers.
     TooFewInliers,
     /// The recording or receiver that poses are taken from has none for this sweep.
     NoSource,
-    /// A pose was found, but too little speaks for it.
+    /// A pose was found, but its confidence is too low.
     LowConfidence,
-    /// The localizer could not compute.
+    /// The localizer failed to compute.
     Failed,
 }
 
@@ -60,7 +60,7 @@ impl PoseEstimate {
         }
     }
 
-    /// How sure the agent is, 0..=1; 0 without a pose.
+    /// Confidence of the pose, 0..=1; 0 without a pose.
     #[must_use]
     pub fn confidence(&self) -> f32 {
         match self {

@@ -1,4 +1,4 @@
-//! What a process has counted and how long its stages take.
+//! Statistics of a process: ledger and durations of stages.
 
 use serde::{Deserialize, Serialize};
 
@@ -8,32 +8,32 @@ use crate::Limits;
 use crate::ProcessId;
 use crate::WireError;
 
-/// A process's books: any process to the operator, regularly and at the end.
+/// Ledger and stage durations of a process: any process to the operator, regularly and at the end.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Stats {
-    /// Whose.
+    /// Process of these statistics.
     pub process: ProcessId,
-    /// Everything counted since it started.
+    /// All counters since the process started.
     pub ledger: Ledger,
-    /// Its stages.
+    /// Durations of its stages.
     pub stages: Vec<StageSummary>,
 }
 
-/// How long one stage took for one frame.
+/// Duration of one stage for one frame.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct StageTiming {
     /// Name of the stage, at most 64 bytes.
     pub stage: String,
-    /// Nanoseconds.
+    /// Duration, nanoseconds.
     pub nanos: u64,
 }
 
-/// How long one stage takes over many frames.
+/// Duration of one stage over many frames.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct StageSummary {
     /// Name of the stage, at most 64 bytes.
     pub stage: String,
-    /// Frames.
+    /// Number of frames.
     pub count: u64,
     /// Median, milliseconds.
     pub p50_ms: f64,
@@ -41,12 +41,12 @@ pub struct StageSummary {
     pub p95_ms: f64,
     /// 99th percentile, milliseconds.
     pub p99_ms: f64,
-    /// Longest, milliseconds.
+    /// Maximum, milliseconds.
     pub max_ms: f64,
 }
 
 impl StageTiming {
-    /// One stage's time.
+    /// Duration of one stage.
     #[must_use]
     pub fn new(stage: &str, time: std::time::Duration) -> Self {
         Self { stage: stage.into(), nanos: u64::try_from(time.as_nanos()).unwrap_or(u64::MAX) }

@@ -1,4 +1,4 @@
-//! Points as bodies: LiDAR and radar sweeps, and the points an agent shares for early fusion.
+//! Sweeps and points: LiDAR, radar, and the points that an agent shares for early fusion.
 
 use serde::{Deserialize, Serialize};
 
@@ -33,7 +33,7 @@ pub struct Radar {
 /// Body: as [`Lidar`], in the frame of the sender's LiDAR.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Points {
-    /// Where the sender is, and how sure it is of that.
+    /// Pose estimate of the sender with its confidence.
     pub pose: PoseEstimate,
     /// The points.
     pub points: PointCloud,
@@ -49,7 +49,7 @@ pub struct SweepMetadata {
 /// Metadata of [`Points`].
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct PointsMetadata {
-    /// Where the sender is.
+    /// Pose estimate of the sender.
     pub pose: PoseEstimate,
     /// Points in the body.
     pub count: u64,

@@ -1,4 +1,4 @@
-//! What really was there.
+//! Ground truth of a tick: poses and annotated objects.
 
 use serde::{Deserialize, Serialize};
 
@@ -9,9 +9,9 @@ use crate::Limits;
 use crate::Pose;
 use crate::WireError;
 
-/// The truth of one tick: replay to scorer, on a key of its own, so that no pipeline can lean on it by accident.
+/// Ground truth of one tick: replay to scorer, on a key of its own, so that no pipeline can use it by accident.
 ///
-/// Objects are kept as each agent annotates them: which of them count for an ego is the scorer's rule.
+/// Objects are kept as each agent annotates them; the scorer selects those that count for an ego.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Truth {
     /// Tick of the scene, counted from 0.
@@ -20,14 +20,14 @@ pub struct Truth {
     pub agents: Vec<AgentTruth>,
 }
 
-/// The truth about one vehicle, and what it annotates.
+/// Ground truth of one vehicle, and its annotations.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct AgentTruth {
-    /// Who.
+    /// Id of the vehicle.
     pub cav: CavId,
-    /// Where its LiDAR really is.
+    /// True pose of its LiDAR.
     pub world_from_lidar: Pose,
-    /// What it annotates.
+    /// Objects that it annotates.
     pub objects: Vec<TrueObject>,
 }
 
@@ -68,7 +68,7 @@ impl TrueObject {
             size_m: self.size_m,
             heading_rad: self.world_from_object.yaw_rad(),
         };
-        // Data sets have objects without length, width or height: one of them must not cost the truth of its moment.
+        // Data sets have objects without length, width or height: one of them must not reject the whole message.
         check_box_from(&box3d, 0.0)?;
         self.speed_mps.map_or(Ok(()), |speed| check_within("speed_mps", speed, -1e3, 1e3))
     }

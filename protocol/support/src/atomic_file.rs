@@ -1,15 +1,15 @@
-//! Files that are there as a whole or not at all.
+//! Atomic file writes: a file appears complete or not at all.
 
 use std::path::Path;
 use std::{fs, io, process};
 
-/// Writes a file that gets its name when all is in it: who reads it never sees half of it, and what had the name before
-/// stays where this fails.
+/// Writes a file under a temporary name and renames it when it is complete: readers never see a partial file, and the
+/// previous file stays if this fails.
 ///
 /// # Errors
-/// What the system says; nothing is left beside the file then.
+/// The error of the system; no temporary file is left then.
 pub fn write(path: &Path, contents: impl AsRef<[u8]>) -> io::Result<()> {
-    // Two processes that write the same file do not write into each other's.
+    // Two processes that write the same file use different temporary names.
     let unfinished = path.with_added_extension(format!("{}.unfinished", process::id()));
     let written = fs::write(&unfinished, contents).and_then(|()| fs::rename(&unfinished, path));
     if written.is_err() {
@@ -23,7 +23,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_file_is_replaced_as_a_whole_and_nothing_stays_beside_it() {
+    fn a_file_is_replaced_as_a_whole_and_no_temporary_file_is_left() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.json");
         for text in ["a long text", "short"] {

@@ -1,4 +1,4 @@
-//! Whole files, of at most a size: a file of gigabytes under the name of a small one must not fill the memory.
+//! Whole files of a bounded size: a file of gigabytes must not fill the memory.
 
 use std::fs::File;
 use std::io::{self, Read};
@@ -7,7 +7,7 @@ use std::path::Path;
 /// Reads a file of at most `max_bytes`.
 ///
 /// # Errors
-/// What the system says, and [`io::ErrorKind::FileTooLarge`] for a larger one.
+/// The error of the system, and [`io::ErrorKind::FileTooLarge`] for a larger file.
 pub fn read(path: &Path, max_bytes: u64) -> io::Result<Vec<u8>> {
     let file = File::open(path)?;
     let stated = file.metadata()?.len();

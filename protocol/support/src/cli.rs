@@ -1,4 +1,4 @@
-//! End of a program: how errors are printed, and the exit codes 0 to 3.
+//! Exit of a program: printed errors, and the exit codes 0 to 3.
 
 use std::error::Error;
 use std::fmt::{Debug, Display};
@@ -6,36 +6,36 @@ use std::process::ExitCode;
 
 use crate::output;
 
-/// Usage or input at fault, and not the program: exit code 2.
+/// Error of usage or input, not of the program: exit code 2.
 #[derive(Debug, thiserror::Error)]
 #[error(transparent)]
 pub struct BadInput(anyhow::Error);
 
 impl BadInput {
-    /// From an error with its causes.
+    /// An error with its causes.
     pub fn of(error: impl Into<anyhow::Error>) -> Self {
         Self(error.into())
     }
 
-    /// From a message.
+    /// An error from a message.
     pub fn new(message: impl Display + Debug + Send + Sync + 'static) -> Self {
         Self(anyhow::Error::msg(message))
     }
 }
 
-/// End of a command that did not fail.
+/// Outcome of a command that did not fail.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Outcome {
-    /// All went well: exit code 0.
+    /// Success: exit code 0.
     Done,
-    /// The input is wrong; the faults are printed already: exit code 2.
+    /// The input is wrong; the errors are printed already: exit code 2.
     BadInput,
     /// Finished, but data were left out or lost: exit code 3.
     DataLost,
 }
 
 impl Outcome {
-    /// Prints a fault of the input.
+    /// Prints an error of the input.
     #[must_use]
     pub fn bad_input(error: &dyn Display) -> Self {
         output::note(format_args!("error: {error}"));
@@ -49,8 +49,8 @@ impl Outcome {
     }
 }
 
-/// Exit code of a command; prints the chain of causes where it failed. `is_bad_input` knows causes that are faults of the
-/// input, beside [`BadInput`].
+/// Exit code of a command; prints the chain of causes of an error. `is_bad_input` recognises causes that are errors of
+/// the input, in addition to [`BadInput`].
 pub fn exit_code(result: anyhow::Result<Outcome>, is_bad_input: impl Fn(&(dyn Error + 'static)) -> bool) -> ExitCode {
     match result {
         Ok(Outcome::Done) => ExitCode::SUCCESS,
@@ -64,7 +64,7 @@ pub fn exit_code(result: anyhow::Result<Outcome>, is_bad_input: impl Fn(&(dyn Er
     }
 }
 
-/// The chain of causes on one line, without those that the message above them quotes already.
+/// The chain of causes on one line, without causes that the message above them quotes already.
 fn chain_of(error: &anyhow::Error) -> String {
     error.chain().fold(String::new(), |text, cause| {
         let cause = cause.to_string();

@@ -1,4 +1,4 @@
-//! CSV files: rows under a known header with errors that name file, line and field, and texts written row by row.
+//! CSV files: rows under a known header with errors that state file, line and field, and texts written row by row.
 
 use std::fmt::Display;
 use std::io;
@@ -10,10 +10,10 @@ use protocol::text::excerpt;
 
 use crate::bounded_file;
 
-/// Characters of a foreign field or line that an error shows.
+/// Maximum number of characters of a foreign field or line in an error.
 const SHOWN_CHARS: usize = 80;
 
-/// Why a CSV file cannot be used.
+/// Error of a CSV file.
 #[derive(Debug, thiserror::Error)]
 pub enum CsvError {
     /// The file is missing or not readable.
@@ -21,32 +21,32 @@ pub enum CsvError {
     Io {
         /// The file.
         path: PathBuf,
-        /// The system's reason.
+        /// Error of the system.
         source: io::Error,
     },
-    /// The first line is another.
+    /// The first line is not the expected header.
     #[error("{}:1: header is {found:?}, must be {expected:?}", path.display())]
     Header {
         /// The file.
         path: PathBuf,
         /// The line found.
         found: String,
-        /// The line that belongs there.
+        /// The expected line.
         expected: &'static str,
     },
-    /// A row is not what it must be.
+    /// A row is not valid.
     #[error("{}:{line}: {problem}", path.display())]
     Row {
         /// The file.
         path: PathBuf,
         /// Line number, from 1.
         line: u64,
-        /// The fault, with the value found and the values allowed.
+        /// The error, with the value found and the values allowed.
         problem: String,
     },
 }
 
-/// A file whose header is as expected.
+/// A file with the expected header.
 #[derive(Debug, Clone)]
 pub struct CsvFile {
     path: PathBuf,
@@ -54,7 +54,7 @@ pub struct CsvFile {
     text: String,
 }
 
-/// One row of a file; blanks around its fields are cut off.
+/// One row of a file; blanks around its fields are removed.
 #[derive(Debug, Clone)]
 pub struct CsvRow<'a> {
     file: &'a CsvFile,
@@ -63,7 +63,7 @@ pub struct CsvRow<'a> {
 }
 
 impl CsvFile {
-    /// Reads a file of at most `max_bytes` whose first line is `header`, the names of the columns with commas between.
+    /// Reads a file of at most `max_bytes` whose first line is `header`, the column names separated by commas.
     ///
     /// # Errors
     /// [`CsvError::Io`] and [`CsvError::Header`].
@@ -84,14 +84,14 @@ impl CsvFile {
         Err(CsvError::Header { path: self.path, found, expected: self.header })
     }
 
-    /// The rows below the header; lines without content are left out.
+    /// The rows below the header; lines without content are skipped.
     pub fn rows(&self) -> impl Iterator<Item = CsvRow<'_>> {
         records(&self.text).skip(1).map(|(line, record)| CsvRow { file: self, line, record })
     }
 }
 
 impl CsvRow<'_> {
-    /// A field by its place; empty where the row is too short.
+    /// A field by its index; empty if the row is too short.
     #[must_use]
     pub fn field(&self, column: usize) -> &str {
         self.record.get(column).unwrap_or_default()
@@ -109,16 +109,16 @@ impl CsvRow<'_> {
         Err(self.fault(format_args!("{:?} has {} columns, must be {expected}", self.shown(), self.record.len())))
     }
 
-    /// A field as a number within `range`; `must` says in words which numbers are allowed.
+    /// A field as a number within `range`; `must` describes the allowed numbers.
     ///
     /// # Errors
-    /// [`CsvError::Row`] names the field.
+    /// [`CsvError::Row`] states the field.
     pub fn number(&self, column: usize, range: RangeInclusive<f64>, must: &str) -> Result<f64, CsvError> {
         let number = self.field(column).parse().ok().filter(|number| range.contains(number));
         number.ok_or_else(|| self.wrong(column, must))
     }
 
-    /// The error for a field that is not what it must be.
+    /// The error for a field that is not valid.
     #[must_use]
     pub fn wrong(&self, column: usize, must: impl Display) -> CsvError {
         let name = self.file.header.split(',').nth(column).unwrap_or_default();
@@ -146,13 +146,13 @@ pub fn records(text: &str) -> impl Iterator<Item = (u64, StringRecord)> {
         .from_reader(text.as_bytes());
     let next = move || {
         let mut record = StringRecord::new();
-        // Text in memory gives no other errors than an end.
+        // Text in memory has no errors but the end.
         let is_there = reader.read_record(&mut record).unwrap_or(false);
         is_there.then_some(record)
     };
     std::iter::from_fn(next).filter_map(|record| {
         let position = record.position()?;
-        // The reader passes over empty lines after it has noted the position.
+        // The reader skips empty lines after it has stored the position.
         let rest = text.as_bytes().get(usize::try_from(position.byte()).ok()?..)?;
         let empty_lines = rest.iter().take_while(|byte| **byte == b'\n').count() as u64;
         let is_blank = record.iter().all(str::is_empty) && record.len() == 1;
@@ -160,12 +160,12 @@ pub fn records(text: &str) -> impl Iterator<Item = (u64, StringRecord)> {
     })
 }
 
-/// A CSV text that grows row by row; fields get quotes where they need them.
+/// A CSV text that is written row by row; fields are quoted if necessary.
 #[derive(Debug)]
 pub struct CsvText(Writer<Vec<u8>>);
 
 impl CsvText {
-    /// A text that begins with `header`, the names of the columns with commas between.
+    /// A text that begins with `header`, the column names separated by commas.
     #[must_use]
     pub fn new(header: &str) -> Self {
         let mut text = Self::headless();
@@ -202,7 +202,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_written_is_read_with_its_quotes() {
+    fn quoted_fields_round_trip() {
         let mut text = CsvText::new("name, size_m");
         text.row(["a, \"b\"", "1.5"]);
         text.row(["no_pose"]);
@@ -224,7 +224,7 @@ mod tests {
     }
 
     #[test]
-    fn a_fault_names_file_line_field_and_both_values() {
+    fn an_error_states_file_line_field_and_both_values() {
         let file_with = |row: &str| file(&format!("name,size_m\n{row}\n")).unwrap();
         let message = |row: &str| {
             let file = file_with(row);

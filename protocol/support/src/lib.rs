@@ -1,11 +1,10 @@
-//! Program support: what all programs share and no crate of the field offers.
+//! Program support: common functions of all programs that no crate of the field offers.
 //!
-//! - [`cli`]: errors and exit codes; [`sibling_program`]: subcommands that another program carries out.
+//! - [`cli`]: errors and exit codes; [`sibling_program`]: subcommands that another program executes.
 //! - [`output`], [`progress`], [`text_table`]: standard output and error, progress bars, tables.
-//! - [`bounded_file`], [`atomic_file`], [`csv_file`]: reads with a limit on their size, files that appear complete or not at
-//!   all, CSV.
+//! - [`bounded_file`], [`atomic_file`], [`csv_file`]: reads with a limit on their size, atomic writes, CSV.
 //! - [`statistics`], [`stage_times`], [`nanos`]: quantiles and correlations, the stopwatch, durations in nanoseconds.
-//! - [`random`]: seeds derived from seeds, and draws that depend on nothing else.
+//! - [`random`]: seeds derived from seeds, and draws that depend on the seed only.
 
 #![warn(clippy::print_stdout, clippy::print_stderr)]
 

@@ -1,20 +1,20 @@
-//! Whole nanoseconds of times; times that do not fit become the nearest that does.
+//! Durations and times as whole nanoseconds; values out of range become the nearest in range.
 
 use std::time::{Duration, Instant};
 
-/// Of a span of time.
+/// Nanoseconds of a duration.
 #[must_use]
 pub fn of(time: Duration) -> u64 {
     u64::try_from(time.as_nanos()).unwrap_or(u64::MAX)
 }
 
-/// From `began` to `at`; 0 where that is earlier.
+/// Nanoseconds from `began` to `at`; 0 if `at` is earlier.
 #[must_use]
 pub fn between(began: Instant, at: Instant) -> u64 {
     of(at.saturating_duration_since(began))
 }
 
-/// Of milliseconds, rounded; 0 for negative ones and for NaN.
+/// Nanoseconds of milliseconds, rounded; 0 for negative values and for NaN.
 #[must_use]
 pub fn of_ms(ms: f64) -> u64 {
     (ms * 1e6).round().max(0.0) as u64

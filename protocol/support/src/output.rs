@@ -1,7 +1,7 @@
-//! Standard output and error of the programs: a reader that closes its end (`| head -1`) ends nothing.
+//! Standard output and error of the programs: a reader that closes its end (`| head -1`) is no error.
 //!
-//! `println!` panics where nobody reads any more. What is printed here goes nowhere then, and the program comes to its end
-//! with the exit code that it would have had. Other failures, a full disk for example, are errors.
+//! `println!` panics if the reader has closed its end. These functions discard the text then, and the program ends with
+//! its usual exit code. Other failures, a full disk for example, are errors.
 
 use std::fmt::Display;
 use std::io::{self, ErrorKind, Write};
@@ -9,12 +9,12 @@ use std::io::{self, ErrorKind, Write};
 /// Prints a line to standard output.
 ///
 /// # Errors
-/// When it cannot be written, and that not because nobody reads any more.
+/// When the line cannot be written for another reason than a closed reader.
 pub fn line(line: impl Display) -> io::Result<()> {
     print(io::stdout().lock(), format_args!("{line}\n"))
 }
 
-/// Prints a text, which brings its own line ends, to standard output.
+/// Prints a text with its own line ends to standard output.
 ///
 /// # Errors
 /// As [`line()`].
@@ -22,7 +22,7 @@ pub fn text(text: impl Display) -> io::Result<()> {
     print(io::stdout().lock(), text)
 }
 
-/// Prints a line to standard error. Where that fails there is no place left to say so.
+/// Prints a line to standard error. A failure cannot be reported and is ignored.
 pub fn note(line: impl Display) {
     let _ = print(io::stderr().lock(), format_args!("{line}\n"));
 }
@@ -39,10 +39,10 @@ fn print(mut to: impl Write, text: impl Display) -> io::Result<()> {
 mod tests {
     use super::*;
 
-    /// Takes nothing, for one reason.
-    struct Refusing(ErrorKind);
+    /// Rejects every write with one error.
+    struct FailingWriter(ErrorKind);
 
-    impl Write for Refusing {
+    impl Write for FailingWriter {
         fn write(&mut self, _: &[u8]) -> io::Result<usize> {
             Err(self.0.into())
         }
@@ -53,9 +53,9 @@ mod tests {
     }
 
     #[test]
-    fn a_reader_that_has_gone_is_no_error_and_a_full_disk_is() {
-        assert!(print(Refusing(ErrorKind::BrokenPipe), "text").is_ok());
-        let error = print(Refusing(ErrorKind::StorageFull), "text").unwrap_err();
+    fn a_closed_reader_is_no_error_and_a_full_disk_is() {
+        assert!(print(FailingWriter(ErrorKind::BrokenPipe), "text").is_ok());
+        let error = print(FailingWriter(ErrorKind::StorageFull), "text").unwrap_err();
         assert_eq!(error.kind(), ErrorKind::StorageFull);
         assert!(error.to_string().contains("standard output"), "{error}");
     }

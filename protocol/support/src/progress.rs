@@ -1,22 +1,22 @@
-//! Progress bar on standard error, of one style for all programs; silent where standard error is no terminal.
+//! Progress bar on standard error, of one style for all programs; silent if standard error is no terminal.
 
 use std::io::{IsTerminal, stderr};
 
 use indicatif::{ProgressBar, ProgressStyle};
 
-/// A bar over `total` steps that are called `unit`, for example `frames`; its message, if any, stands behind it.
+/// A bar over `total` steps with the name `unit`, for example `frames`; its message, if any, is behind it.
 #[must_use]
 pub fn bar(total: usize, unit: &str) -> ProgressBar {
     with_template(total, &format!("{{bar:30}} {{pos}}/{{len}} {unit}  {{eta}} left  {{msg}}"))
 }
 
-/// A bar over 1000 steps for each of `count` parts, which counts in per cent.
+/// A bar over 1000 steps for each of `count` parts, which displays per cent.
 #[must_use]
 pub fn percent_bar(count: usize) -> ProgressBar {
     with_template(1000 * count, "{bar:30} {percent} %  {elapsed}, {eta} left  {msg}")
 }
 
-/// A count of steps that are called `unit`, where nobody knows how many there will be.
+/// A counter of steps with the name `unit`, for an unknown total.
 #[must_use]
 pub fn spinner(unit: &str) -> ProgressBar {
     styled(ProgressBar::new_spinner(), &format!("{{spinner}} {{pos}} {unit}  {{msg}}"))

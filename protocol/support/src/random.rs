@@ -1,64 +1,64 @@
-//! Seeded random numbers: a stream that this file fixes, so that a seed means the same bytes on every machine.
+//! Seeded random numbers: streams fixed by this file, so that a seed gives the same bytes on every machine.
 //!
 //! Two generators, each with one use:
 //!
-//! - [`SplitMix64`] where a simulation draws: sensors, traffic, weather, the channel, attacks, damaged test inputs. A
-//!   stream is cheap to begin, so each event has one of its own by [`SplitMix64::derived`] and no draw depends on how many
-//!   others came before it; a run may be cut into ticks, processes and threads.
-//! - `ChaCha8Rng` where an algorithm draws in one sequence: training and its augmentation, RANSAC, k-means, noise of
-//!   poses, the layout of a generated town. It can be sought to any place of its stream and serves `rand`'s distributions
-//!   and shuffles.
+//! - [`SplitMix64`] for simulations: sensors, traffic, weather, the channel, attacks, damaged test inputs. A stream is
+//!   cheap to start, so each event has one of its own by [`SplitMix64::derived`] and no draw depends on the number of
+//!   draws before it; a run may be divided into ticks, processes and threads.
+//! - `ChaCha8Rng` for algorithms that draw in one sequence: training and its augmentation, RANSAC, k-means, noise of
+//!   poses, the layout of a generated scene. It can seek to any position of its stream and supports `rand`'s
+//!   distributions and shuffles.
 //!
-//! Results and published data sets depend on both streams: new code follows the rule, and code that draws keeps its
+//! Results and published data sets depend on both streams: new code follows the rule, and existing code keeps its
 //! generator.
 
 use rand::RngCore;
 
-/// SplitMix64 (Steele, Lea and Flood 2014): one addition and one mix a number, and any 64-bit state is a good seed.
+/// SplitMix64 (Steele, Lea and Flood 2014): one addition and one mix per number, and any 64-bit state is a good seed.
 ///
-/// Chosen over a generator of a crate because a scene draws two numbers a ray, and because a new release of a crate
-/// must not change what a seed makes.
+/// Preferred to a generator of a crate because a scene draws two numbers per ray, and because a new release of a crate
+/// must not change the numbers of a seed.
 #[derive(Debug, Clone)]
 pub struct SplitMix64 {
     state: u64,
 }
 
 impl SplitMix64 {
-    /// A stream that begins at `seed`.
+    /// A stream with the state `seed`.
     #[must_use]
     pub fn new(seed: u64) -> Self {
         Self { state: seed }
     }
 
     /// The stream of one `purpose` under `seed`, for example the noise of one sweep: streams of different labels do not
-    /// overlap in practice, and no stream depends on how many numbers another one drew.
+    /// overlap in practice, and no stream depends on the number of draws of another.
     #[must_use]
     pub fn derived(seed: u64, purpose: &[u64]) -> Self {
         Self { state: derive_seed(seed, purpose) }
     }
 
-    /// A number in 0..1.
+    /// Uniform random number in 0..1.
     pub fn unit(&mut self) -> f64 {
         // The upper 53 bits fill the mantissa.
         (self.next_u64() >> 11) as f64 * (1.0 / (1u64 << 53) as f64)
     }
 
-    /// A number in `low..high`.
+    /// Uniform random number in `low..high`.
     pub fn between(&mut self, low: f64, high: f64) -> f64 {
         low + (high - low) * self.unit()
     }
 
-    /// A whole number in `0..count`; 0 when there is nothing to choose from.
+    /// Uniform integer in `0..count`; 0 if `count` is 0.
     pub fn below(&mut self, count: usize) -> usize {
         ((u128::from(self.next_u64()) * count as u128) >> 64) as usize
     }
 
-    /// Whether an event of this probability happens.
+    /// True with this probability.
     pub fn chance(&mut self, probability: f64) -> bool {
         self.unit() < probability
     }
 
-    /// A normal number of mean 0 and deviation 1.
+    /// Normal random number with mean 0 and standard deviation 1.
     pub fn normal(&mut self) -> f64 {
         rand_distr::Distribution::sample(&rand_distr::StandardNormal, self)
     }
@@ -107,7 +107,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_stream_is_the_published_one() {
+    fn the_stream_matches_the_reference() {
         // First outputs of the reference implementation for seed 1234567.
         let mut random = SplitMix64::new(1_234_567);
         assert_eq!(random.next_u64(), 6_457_827_717_110_365_317);
@@ -129,7 +129,7 @@ mod tests {
     }
 
     #[test]
-    fn unit_numbers_have_the_moments_of_a_uniform_law() {
+    fn unit_numbers_have_the_moments_of_a_uniform_distribution() {
         let mut random = SplitMix64::new(7);
         let draws: Vec<f64> = (0..100_000).map(|_| random.unit()).collect();
         let mean = draws.iter().sum::<f64>() / draws.len() as f64;

@@ -1,7 +1,7 @@
-//! Sibling programs: a subcommand that another program of the same folder carries out.
+//! Sibling programs: a subcommand that another program of the same folder executes.
 //!
-//! A vehicle carries the program of its process alone. Training and evaluation lie in a program of their own, with the
-//! readers of data sets, and are reached by the same name, as Git and Cargo do it.
+//! A vehicle carries the program of its process only. Training and evaluation are in a program of their own, with the
+//! readers of data sets, and are called by the same name, as Git and Cargo do it.
 
 use std::env;
 use std::ffi::OsString;
@@ -9,7 +9,7 @@ use std::io;
 use std::os::unix::process::CommandExt;
 use std::process::Command;
 
-/// Arguments of a subcommand that a sibling program carries out, `--help` included.
+/// Arguments of a subcommand that a sibling program executes, `--help` included.
 #[derive(Debug, clap::Args)]
 #[command(disable_help_flag = true)]
 pub struct Forwarded {
@@ -19,7 +19,7 @@ pub struct Forwarded {
 }
 
 impl Forwarded {
-    /// Replaces this process by `program`, which lies beside it, or else on the `PATH`. Returns only where that fails.
+    /// Replaces this process by `program`, from the same folder or else from `PATH`. Returns only on failure.
     #[must_use]
     pub fn exec(&self, program: &str, subcommand: &str) -> io::Error {
         let beside = env::current_exe().ok().map(|own| own.with_file_name(program)).filter(|path| path.exists());

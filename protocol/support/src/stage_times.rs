@@ -1,10 +1,10 @@
-//! Stopwatch: time per stage, in the order of the stages.
+//! Stage times: duration of each stage, in the order of the stages.
 
 use std::time::{Duration, Instant};
 
 use protocol::StageTiming;
 
-/// Times of stages that follow each other.
+/// Durations of consecutive stages.
 #[derive(Debug, Clone)]
 pub struct StageTimes {
     last: Instant,
@@ -18,7 +18,7 @@ impl StageTimes {
         Self { last: Instant::now(), timings: Vec::new() }
     }
 
-    /// Ends a stage and starts the next one; the time it took.
+    /// Ends a stage and starts the next one; returns its duration.
     pub fn lap(&mut self, stage: &str) -> Duration {
         let now = Instant::now();
         let took = now - self.last;

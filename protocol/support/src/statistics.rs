@@ -17,8 +17,8 @@ pub fn sorted(values: &[f64]) -> Vec<f64> {
 /// The quantile `q` (0..=1) of a sample in ascending order, interpolated linearly between the two nearest ranks as by
 /// NumPy's default (method 7 of Hyndman and Fan 1996); `None` for an empty sample.
 ///
-/// Every p50, p95 and p99 of a report is this one. Order statistics that a fitted model takes as its input are not
-/// percentiles of a report and keep the rule that the model was fitted with.
+/// Every p50, p95 and p99 of a report is computed here. Order statistics that a fitted model takes as its input are not
+/// percentiles of a report and keep the rule with which the model was fitted.
 #[must_use]
 pub fn quantile(sorted: &[f64], q: f64) -> Option<f64> {
     let last = sorted.len().checked_sub(1)?;
@@ -26,7 +26,7 @@ pub fn quantile(sorted: &[f64], q: f64) -> Option<f64> {
     let below = (rank.floor() as usize).min(last);
     let above = (below + 1).min(last);
     let (low, high, share) = (sorted[below], sorted[above], rank - below as f64);
-    // Infinite values have no difference.
+    // The difference of infinite values is undefined.
     Some(if share == 0.0 || low == high { low } else { low + (high - low) * share })
 }
 
@@ -53,7 +53,7 @@ mod tests {
     }
 
     #[test]
-    fn infinite_values_are_values() {
+    fn infinite_values_are_allowed() {
         let sample = [1.0, f64::INFINITY, f64::INFINITY];
         assert_eq!(
             [0.0, 0.25, 0.5, 0.75].map(|q| quantile(&sample, q)),

@@ -4,12 +4,12 @@ use std::fmt;
 
 use comfy_table::{CellAlignment, Table, presets};
 
-/// Side that the cells of a column stand on.
+/// Alignment of the cells of a column.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Side {
-    /// Texts.
+    /// Left, for texts.
     Left,
-    /// Numbers.
+    /// Right, for numbers.
     Right,
 }
 
@@ -51,7 +51,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn texts_stand_left_and_numbers_right() {
+    fn texts_are_left_aligned_and_numbers_right_aligned() {
         let mut table = TextTable::new([("name", Side::Left), ("size", Side::Right), ("note", Side::Left)]);
         table.row(["a".to_owned(), "1.5".to_owned(), "largest".to_owned()]);
         table.row(["longer".to_owned(), "12345".to_owned(), String::new()]);

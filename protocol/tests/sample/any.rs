@@ -1,4 +1,4 @@
-//! Any message whatever: proptest strategies.
+//! Arbitrary messages: proptest strategies.
 
 use proptest::collection::vec;
 use proptest::option;

@@ -1,5 +1,5 @@
-//! Messages to test with: one of every kind with every field set, and any at all.
-#![allow(dead_code, reason = "not every test file uses all of it")]
+//! Sample messages for tests: one of every kind with every field set, and arbitrary ones.
+#![allow(dead_code, reason = "not every test file uses every sample")]
 
 pub(crate) mod any;
 
@@ -29,7 +29,7 @@ pub(crate) fn confidence() -> Vec<f32> {
     (0..12 * 16).map(|cell| (cell * 29 % 97) as f32 / 97.0).collect()
 }
 
-/// Turned by 2 atan(3/4), in numbers that are the same on every machine.
+/// Rotated by 2 atan(3/4), in numbers that are the same on every machine.
 fn pose_at(translation_m: [f64; 3]) -> Pose {
     Pose { translation_m, rotation_wxyz: [0.8, 0.0, 0.0, 0.6] }
 }
@@ -47,7 +47,7 @@ fn detection(score: f32) -> Detection {
     Detection { box3d, score, source: Some(cav("-1")) }
 }
 
-/// A map in every codec: dtype times selection times packing.
+/// A feature map in every codec: dtype times selection times compression.
 pub(crate) fn every_codec() -> Vec<CodecConfig> {
     let mut configs = Vec::new();
     for dtype in [Dtype::F32, Dtype::F16, Dtype::I8] {
@@ -64,15 +64,15 @@ pub(crate) fn bev(config: &CodecConfig) -> Bev {
     Bev { pose: pose(), features: encode_features(features(), config, Some(&confidence())).unwrap() }
 }
 
-/// A map that had to keep within a limit.
+/// A feature map that had to keep within a limit.
 pub(crate) fn adapted_bev() -> Bev {
     let limit = ByteLimit { bytes: 600, by: LimitedBy::Queue };
     let features = encode_within(features(), &CodecConfig::default(), &limit, Some(&confidence())).unwrap();
     Bev { pose: pose(), features }
 }
 
-/// A code of three channels that stands for a map of 24.
-pub(crate) fn squeezed_bev() -> Bev {
+/// A code of three channels for a feature map of 24.
+pub(crate) fn compressed_bev() -> Bev {
     let features = BevFeatures { code_of: Some(24), ..features() };
     Bev { pose: pose(), features: encode_features(features, &CodecConfig::default(), None).unwrap() }
 }
@@ -177,7 +177,7 @@ pub(crate) fn every_kind() -> Vec<Message> {
     ];
     messages.extend(every_codec().iter().map(|config| Message::Bev(bev(config))));
     messages.push(Message::Bev(adapted_bev()));
-    messages.push(Message::Bev(squeezed_bev()));
+    messages.push(Message::Bev(compressed_bev()));
     let controls = [
         Control::Start { rate: 1.0 },
         Control::Pause,

@@ -1,6 +1,6 @@
 //! Reading sweeps: `decode/<encoding>/<points>`.
 //!
-//! One case alone: `cargo bench -p sim-replay --bench pcd -- decode/ascii`.
+//! One case alone: `cargo bench -p dataset --bench pcd -- decode/ascii`.
 
 use std::hint::black_box;
 

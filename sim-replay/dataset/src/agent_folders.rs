@@ -1,5 +1,5 @@
-//! The folders of the OPV2V family: `<root>/<split>/<scenario>/<agent>/<frame>.yaml` with a sweep beside it, entered at any
-//! level.
+//! The folders of the OPV2V family: `<root>/<split>/<scenario>/<agent>/<frame>.yaml` with a sweep beside it, entered at
+//! any level.
 
 use std::collections::{BTreeMap, BTreeSet, HashSet};
 use std::path::{Path, PathBuf};
@@ -12,20 +12,20 @@ use super::points::{SweepStorage, Sweeps};
 use super::yaml::{self, Field};
 use super::{MissingFrame, OpenOptions, ReadError, Tick, files};
 
-/// How far below the opened folder scenarios are looked for.
+/// Depth below the opened folder to which scenarios are searched.
 const MAX_DEPTH: usize = 3;
 
-/// A scenario's folder and what lies in it.
+/// Folder of a scenario and its contents.
 #[derive(Debug)]
 pub(super) struct ScenarioFolder {
     pub(super) dir: PathBuf,
     /// Ego first, roadside units last.
     pub(super) agents: Vec<CavId>,
-    /// Stems that any agent has.
+    /// Stems of frames of any agent.
     pub(super) stems: Vec<String>,
-    /// Stems that some agent has and this one has not.
+    /// Stems of frames of some agents, by the agent that lacks them.
     pub(super) missing: Vec<MissingFrame>,
-    /// Suffixes of point files beside the plain one and the radar's.
+    /// Suffixes of point files other than the plain one and the radar's.
     pub(super) variants: Vec<String>,
     pub(super) has_radar: bool,
     /// Suffix of the sweeps.
@@ -52,13 +52,13 @@ fn find_below(dir: &Path, listing: &Listing, depth: usize, found: &mut Vec<PathB
     }
 }
 
-/// True where a folder is an agent's: the likely mistake of opening one level too deep.
+/// True if a folder is an agent's: the likely mistake of opening one level too deep.
 pub(super) fn is_agent(dir: &Path) -> bool {
     files::list(dir).is_ok_and(|listing| is_agent_folder(dir, &listing))
 }
 
-/// CARLA's actor ids with any frame, negative ones for roadside units; other names where a frame is whole and no folder
-/// below has any: a scenario may hold a stray one.
+/// True for names that are CARLA actor ids (negative for roadside units) if there is any frame; for other names if
+/// there is a complete frame and no folder below has one: a scenario may hold a stray folder.
 fn is_agent_folder(dir: &Path, listing: &Listing) -> bool {
     let name = dir.file_name().and_then(|name| name.to_str()).unwrap_or_default();
     if is_number(name) {
@@ -76,7 +76,8 @@ fn is_number(name: &str) -> bool {
     name.parse::<i64>().is_ok()
 }
 
-/// The agents of a scenario with what their folders hold. Copies of folders such as `650 (1)` or `650_old` are none.
+/// The agents of a scenario with the contents of their folders. Copies of folders such as `650 (1)` or `650_old` are
+/// not agents.
 fn agents_in(dir: &Path, problems: &mut Vec<ReadError>) -> Result<Vec<(CavId, Listing)>, ReadError> {
     let mut below = files::list_below(dir, &files::list(dir)?, problems);
     let name = |folder: &Path| folder.file_name().unwrap_or_default().to_string_lossy().into_owned();
@@ -101,7 +102,7 @@ fn agents_in(dir: &Path, problems: &mut Vec<ReadError>) -> Result<Vec<(CavId, Li
 }
 
 impl ScenarioFolder {
-    /// Looks into every agent's folder. What has to be left out goes to `problems`.
+    /// Lists the folders of all agents. Parts that have to be left out are added to `problems`.
     pub(super) fn scan(dir: &Path, problems: &mut Vec<ReadError>) -> Result<Self, ReadError> {
         let listed = agents_in(dir, problems)?;
         let has = |suffix: &str| listed.iter().any(|(_, listing)| holds_pairs(listing, suffix));
@@ -142,7 +143,7 @@ impl ScenarioFolder {
         self.dir.join(agent.as_str()).join(format!("{stem}.yaml"))
     }
 
-    /// True where the sweeps are bare floats, as V2X-Real stores them.
+    /// True if the sweeps are bare floats, as V2X-Real stores them.
     pub(super) fn has_bare_floats(&self) -> bool {
         self.suffix == BIN
     }
@@ -170,8 +171,9 @@ impl ScenarioFolder {
         self.pcd(agent, stem, Some(RADAR))
     }
 
-    /// Capture times of all stems. Stems count simulator ticks, they are no clock: where `data_protocol.yaml` gives the length of a
-    /// tick, time is tick times length; else the smallest step between stems is one `period_nanos`, from 0 on.
+    /// Capture times of all stems. Stems count simulator ticks and are no clock: if `data_protocol.yaml` gives the
+    /// length of a tick, time is tick times length; else the smallest step between stems is one `period_nanos`, from 0
+    /// on.
     pub(super) fn ticks(&self, period_nanos: u64, problems: &mut Vec<ReadError>) -> Vec<Tick> {
         let tick_nanos = self.tick_nanos().unwrap_or_else(|error| {
             problems.push(error);
@@ -191,7 +193,7 @@ impl ScenarioFolder {
         self.stems.iter().zip(times).map(tick).collect()
     }
 
-    /// `world.fixed_delta_seconds` of `data_protocol.yaml` in nanoseconds, where there is such a file and key.
+    /// `world.fixed_delta_seconds` of `data_protocol.yaml` in nanoseconds, if there is such a file and key.
     fn tick_nanos(&self) -> Result<Option<u64>, ReadError> {
         let path = self.dir.join("data_protocol.yaml");
         if !path.is_file() {
@@ -208,7 +210,7 @@ impl ScenarioFolder {
     }
 }
 
-/// One problem for every agent that never has a frame at the ego's ticks: odd stems beside even ones, for example.
+/// One problem for every agent that never has a frame at the ego's ticks: odd stems and even ones, for example.
 fn without_common_frame(
     dir: &Path,
     agents: &[CavId],
@@ -234,8 +236,8 @@ fn without_common_frame(
     strangers.map(problem).collect::<Vec<_>>().into_iter()
 }
 
-/// Text order, as OpenCOOD sorts: `1045` before `650`. Roadside units (negative ids) go last, so that no unit is the ego
-/// where there is a vehicle; OpenCOOD moves the first of them only.
+/// Text order, as OpenCOOD sorts: `1045` before `650`. Roadside units (negative ids) go last, so that no unit is the
+/// ego if there is a vehicle; OpenCOOD moves the first of them only.
 fn in_order<'a>(ids: impl Iterator<Item = &'a CavId>) -> Vec<CavId> {
     let (units, mut agents): (Vec<CavId>, Vec<CavId>) = ids.cloned().partition(|id| id.as_str().starts_with('-'));
     agents.extend(units);
@@ -313,7 +315,7 @@ mod tests {
     }
 
     #[test]
-    fn an_agent_without_a_common_tick_is_named() {
+    fn an_agent_without_a_common_tick_is_reported() {
         let dir = tempfile::tempdir().unwrap();
         touch(dir.path(), &["1/000068.yaml", "1/000068.pcd", "1/000070.yaml", "1/000070.pcd"]);
         touch(dir.path(), &["2/000069.yaml", "2/000069.pcd"]);
@@ -324,7 +326,7 @@ mod tests {
     }
 
     #[test]
-    fn variants_radar_and_other_files_are_told_apart() {
+    fn variants_radar_and_other_files_are_distinguished() {
         let dir = tempfile::tempdir().unwrap();
         touch(dir.path(), &["1/000010.yaml", "1/000010.pcd", "1/000010_radar.pcd", "1/000010_snow_2.5_2.0.pcd"]);
         touch(dir.path(), &["1/000010_fog_0.060.pcd", "1/000010_camera0.png", "1/000010_additional.yaml", "1/a.json"]);

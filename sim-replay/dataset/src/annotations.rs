@@ -1,5 +1,5 @@
-//! Objects and optional fields in the YAML of the OPV2V family. A part that cannot be right is left out and named; the rest
-//! of the frame stays.
+//! Objects and optional fields in the YAML of the OPV2V family. An invalid part is left out and reported; the rest of
+//! the frame is kept.
 
 use std::collections::HashMap;
 use std::path::Path;
@@ -15,14 +15,14 @@ use crate::frame::{Object, ObjectClass};
 const KMH_PER_MPS: f64 = 3.6;
 /// Largest half size of an object, metres. Simulators have written bicycles of 500 m.
 const MAX_HALF_SIZE_M: f64 = 50.0;
-/// Largest angle, degrees: sums of turns are written, garbage is not.
+/// Largest angle, degrees: sums of turns occur in files, larger values are errors.
 const MAX_ANGLE_DEG: f64 = 1e5;
 /// Largest speed, metres per second.
 const MAX_SPEED_MPS: f64 = 1000.0;
-/// Keys of an object's type in the relatives of the format, the first one that is there counts.
+/// Keys of an object's type in related formats; the first key present is used.
 const CLASS_KEYS: [&str; 4] = ["obj_type", "object_type", "class", "type"];
 
-/// A frame's annotations, and what was left out of them.
+/// A frame's annotations, and the parts left out of them.
 #[derive(Debug)]
 pub(super) struct Annotations<'a> {
     root: Field<'a>,
@@ -34,12 +34,12 @@ impl<'a> Annotations<'a> {
         Self { root, problems: Vec::new() }
     }
 
-    /// What was left out.
+    /// Parts that were left out.
     pub(super) fn into_problems(self) -> Vec<Problem> {
         self.problems
     }
 
-    /// The field of the first of `keys` that is there; one that cannot be read is left out.
+    /// The field of the first of `keys` that is present; one that cannot be read is left out.
     pub(super) fn optional<T>(
         &mut self,
         keys: &[&str],
@@ -60,8 +60,8 @@ impl<'a> Annotations<'a> {
         value.ok()
     }
 
-    /// All objects that can be right. `id` gives the id of an object of the listed number, `pose` takes its place in the
-    /// file's numbers to the world.
+    /// All valid objects. `id` gives the id of an object of the listed number, `pose` transforms its pose from the file
+    /// to the world.
     pub(super) fn objects(
         &mut self,
         id: impl Fn(i64, &Field<'a>) -> Result<i64, ReadError>,
@@ -111,13 +111,13 @@ impl<'a> Annotations<'a> {
         match root.optional(key)? {
             Some(field) if matches!(&field.node().value, Value::List(items) if items.is_empty()) => Ok(Vec::new()),
             Some(field) => field.entries().map_err(|_| field.expected("a map of objects by id")),
-            // An empty map may be written as nothing; a key that is not there is a fault.
+            // An empty map may be written as nothing; a missing key is a fault.
             None if root.has(key) => Ok(Vec::new()),
             None => root.required(key).map(|_| Vec::new()),
         }
     }
 
-    /// A car where no type is given. An unknown type is no vehicle, and is named once per scenario.
+    /// A car if no type is given. An unknown type is not a vehicle, and is reported once per scenario.
     fn class(&mut self, field: &Field<'a>) -> ObjectClass {
         let kind = CLASS_KEYS.iter().find_map(|key| Some((*key, field.optional(key).ok().flatten()?)));
         let Some((key, kind)) = kind else { return ObjectClass::Car };
@@ -147,7 +147,7 @@ fn listed_id(key: &str, field: &Field<'_>) -> Result<i64, ReadError> {
     id.ok_or_else(|| field.error(format!("{key:?} is no object id, expected an integer")))
 }
 
-/// The box's centre and how it is turned, in the numbers of the file.
+/// Centre and rotation of the box, in the numbers of the file.
 fn place(field: &Field<'_>) -> Result<CarlaPose, ReadError> {
     let center = field.optional("center")?.map_or(Ok([0.0; 3]), |center| center.numbers::<3>())?;
     let (location, angle) = (field.required("location")?.numbers()?, field.required("angle")?);
@@ -168,7 +168,7 @@ fn size_m(field: &Field<'_>) -> Result<[f64; 3], ReadError> {
     Ok(half.map(|half| 2.0 * half))
 }
 
-/// km/h to m/s. Relatives of the format write a vector; its length is the speed.
+/// km/h to m/s. Related formats write a vector; its length is the speed.
 pub(super) fn speed_mps(field: &Field<'_>) -> Result<f64, ReadError> {
     let kmh = match field.number() {
         Ok(kmh) => kmh,
@@ -178,6 +178,6 @@ pub(super) fn speed_mps(field: &Field<'_>) -> Result<f64, ReadError> {
         }
     };
     let mps = kmh / KMH_PER_MPS;
-    // Not a number is not smaller either.
+    // NaN does not satisfy this comparison.
     if mps.abs() <= MAX_SPEED_MPS { Ok(mps) } else { Err(field.error(format!("{kmh} km/h is no speed"))) }
 }

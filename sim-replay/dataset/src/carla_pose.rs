@@ -31,7 +31,7 @@ impl From<CarlaPose> for [f64; 6] {
 
 impl CarlaPose {
     /// The pose of a box from the actor it belongs to: `center_m`, the offset of the box's centre, is added to
-    /// `location_m` without turning it, as OpenCOOD does (`opencood/utils/box_utils.py`).
+    /// `location_m` without rotation, as OpenCOOD does (`opencood/utils/box_utils.py`).
     #[must_use]
     pub fn of_box(location_m: [f64; 3], roll_yaw_pitch_deg: [f64; 3], center_m: [f64; 3]) -> Self {
         Self { position_m: std::array::from_fn(|axis| location_m[axis] + center_m[axis]), roll_yaw_pitch_deg }
@@ -71,15 +71,15 @@ impl CarlaPose {
         Isometry3::from_parts(translation, UnitQuaternion::from_rotation_matrix(&rotation)).into()
     }
 
-    /// The way back: a pose of ours as CARLA would write it, angles within +-180 degrees (pitch within +-90).
+    /// Inverse conversion: the pose as CARLA would write it, angles within +-180 degrees (pitch within +-90).
     #[must_use]
     pub fn from_pose(pose: &Pose) -> Self {
         let rotation = mirrored_rotation(pose.isometry().rotation.to_rotation_matrix().matrix());
         Self::from_parts(mirrored_point(pose.translation_m), &rotation)
     }
 
-    /// The numbers for which [`Self::left_handed_matrix`] is the matrix of a pose of ours, nothing mirrored: V2V4Real and
-    /// V2X-Real use the formula in right-handed axes.
+    /// The numbers for which [`Self::left_handed_matrix`] is the matrix of a right-handed pose, without mirroring:
+    /// V2V4Real and V2X-Real use the formula in right-handed axes.
     #[must_use]
     pub fn from_right_handed(pose: &Pose) -> Self {
         Self::from_parts(pose.translation_m, pose.isometry().rotation.to_rotation_matrix().matrix())
@@ -93,7 +93,7 @@ impl CarlaPose {
     }
 }
 
-/// A point with y turned round, which is how points and positions change handedness.
+/// A point with y negated, which changes its handedness.
 #[must_use]
 pub fn mirrored_point([x, y, z]: [f64; 3]) -> [f64; 3] {
     [x, -y, z]

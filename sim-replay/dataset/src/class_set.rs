@@ -1,4 +1,4 @@
-//! Sets of object classes: which annotated objects a detector is expected to find.
+//! Sets of object classes: the classes of annotated objects that a detector is expected to find.
 
 use std::fmt;
 use std::str::FromStr;
@@ -19,16 +19,16 @@ pub struct ClassSet(u8);
 impl ClassSet {
     /// Cars, vans, trucks and buses.
     pub const VEHICLES: Self = Self(0b000_1111);
-    /// Everything but pedestrians, as V2V4Real counts.
+    /// Everything but pedestrians, as V2V4Real evaluates.
     pub const ALL_BUT_PEDESTRIANS: Self = Self(0b101_1111);
 
-    /// Whether a class is among them.
+    /// True if a class is in the set.
     #[must_use]
     pub fn contains(self, class: ObjectClass) -> bool {
         self.0 & bit(class) != 0
     }
 
-    /// Their names; `vehicle` where all four kinds of vehicles are among them.
+    /// Their names; `vehicle` if all four kinds of vehicles are in the set.
     #[must_use]
     pub fn names(self) -> Vec<String> {
         let has_vehicles = self.0 & Self::VEHICLES.0 == Self::VEHICLES.0;
@@ -50,7 +50,7 @@ impl ClassSet {
                 bit(asked.parse().map_err(|error: UnknownClass| error.to_string())?)
             };
         }
-        if set.0 == 0 { Err("no class is named".into()) } else { Ok(set) }
+        if set.0 == 0 { Err("no class is given".into()) } else { Ok(set) }
     }
 }
 
@@ -109,7 +109,7 @@ mod tests {
     }
 
     #[test]
-    fn an_unknown_class_is_named_with_those_that_are_known() {
+    fn an_unknown_class_is_reported_with_the_known_ones() {
         let error = "vehicles".parse::<ClassSet>().unwrap_err();
         assert!(error.starts_with("\"vehicles\" is no class: expected vehicle, car,"), "{error}");
         assert!("".parse::<ClassSet>().is_err());

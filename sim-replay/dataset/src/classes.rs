@@ -1,7 +1,7 @@
 //! Names of object classes in the annotations of all layouts.
 //!
-//! Letters count, not their case, and neither do blanks, `_` and `-`. Names are those of V2V4Real, V2X-Real and V2XPnP
-//! (their misspellings included), V2X-Radar, RCooper, DAIR-V2X, KITTI, nuScenes, and CARLA's blueprints.
+//! Names are compared without case, blanks, `_` and `-`. They are those of V2V4Real, V2X-Real and V2XPnP (their
+//! misspellings included), V2X-Radar, RCooper, DAIR-V2X, KITTI, nuScenes, and CARLA's blueprints.
 
 use std::path::Path;
 
@@ -16,7 +16,7 @@ const BLUEPRINTS: [(ObjectClass, &[&str]); 4] = [
     (ObjectClass::Bus, &["fusorosa"]),
 ];
 
-/// The class of a name; `None` where the name is not known.
+/// The class of a name; `None` if the name is unknown.
 pub(super) fn of_name(name: &str) -> Option<ObjectClass> {
     if let Some(class) = of_library(&name.to_ascii_lowercase()) {
         return Some(class);
@@ -61,13 +61,13 @@ pub(super) fn of_name(name: &str) -> Option<ObjectClass> {
     })
 }
 
-/// The finding about a type that is not known, the same for all its objects below `dir`.
+/// The finding about an unknown type, the same for all its objects below `dir`.
 pub(super) fn unknown(dir: &Path, field: &str, found: &str) -> Problem {
     Problem::from(&ReadError::Malformed {
         path: dir.to_owned(),
         line: None,
         field: Some(field.to_owned()),
-        reason: format!("{found} is no known type of object: it counts as other, not as a vehicle"),
+        reason: format!("{found} is an unknown type of object: it counts as other, not as a vehicle"),
     })
 }
 

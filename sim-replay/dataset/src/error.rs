@@ -1,40 +1,40 @@
-//! What is wrong with a dataset, with the place where it is wrong.
+//! Read errors: faults of a dataset, with their position.
 
 use std::fmt;
 use std::path::{Path, PathBuf};
 
-/// Why a dataset, or a frame of it, cannot be read.
+/// Reasons why a dataset, or a frame of it, cannot be read.
 #[derive(Debug, thiserror::Error)]
 pub enum ReadError {
-    /// The operating system refused.
+    /// An error of the operating system.
     #[error("{}: {source}", path.display())]
     Io {
         /// The file or folder.
         path: PathBuf,
-        /// What the system says.
+        /// Error of the operating system.
         source: std::io::Error,
     },
-    /// The folder is no layout that is known here.
+    /// The folder has no supported layout.
     #[error("{}: {reason}", path.display())]
     Layout {
         /// The folder.
         path: PathBuf,
-        /// What was looked for and found.
+        /// Expected and found contents.
         reason: String,
     },
-    /// A file says something that cannot be.
+    /// A file has invalid content.
     #[error("{}{}: {}{reason}", path.display(), Line(*.line), Field(field.as_deref()))]
     Malformed {
         /// The file.
         path: PathBuf,
-        /// The line, from 1, where the file has lines.
+        /// The line, from 1, if the file has lines.
         line: Option<u64>,
         /// The field, for example `vehicles.4335.extent`.
         field: Option<String>,
-        /// What was found and what was expected.
+        /// Found and expected value.
         reason: String,
     },
-    /// The agent takes no part at the tick: it came later, has left, or its files are missing.
+    /// The agent has no frame at the tick: it joined later, has left, or its files are missing.
     #[error("scenario {scenario}: agent {agent} has no frame at tick {tick}")]
     Absent {
         /// The scenario.
@@ -44,16 +44,16 @@ pub enum ReadError {
         /// Stem of the tick.
         tick: String,
     },
-    /// The caller asked for an agent, a tick or a variant that the scenario does not have.
+    /// The requested agent, tick or variant does not exist in the scenario.
     #[error("scenario {scenario}: {what} {asked} does not exist ({available})")]
     NoSuch {
         /// The scenario.
         scenario: String,
         /// `agent`, `tick` or `LiDAR variant`.
         what: &'static str,
-        /// What was asked for.
+        /// Requested name or index.
         asked: String,
-        /// What there is.
+        /// Available names or indices.
         available: String,
     },
 }
@@ -69,7 +69,7 @@ impl ReadError {
         Self::Io { path: path.to_owned(), source }
     }
 
-    /// The same with what follows from it at the end of the reason.
+    /// The same error with its consequence at the end of the reason.
     #[must_use]
     pub fn with_consequence(mut self, consequence: &str) -> Self {
         if let Self::Malformed { reason, .. } | Self::Layout { reason, .. } = &mut self {
@@ -78,7 +78,7 @@ impl ReadError {
         self
     }
 
-    /// The file or folder at fault, if the error is about one.
+    /// The file or folder at fault, if the error concerns one.
     #[must_use]
     pub fn path(&self) -> Option<&Path> {
         match self {
@@ -87,7 +87,7 @@ impl ReadError {
         }
     }
 
-    /// Whether nothing is wrong but that the agent is not there at the tick.
+    /// True if the only fault is that the agent has no frame at the tick.
     #[must_use]
     pub fn is_absence(&self) -> bool {
         matches!(self, Self::Absent { .. })

@@ -1,7 +1,9 @@
-//! Evaluation protocols: whose annotations count, where, of which classes, and how average precision is ordered.
+//! Evaluation protocols: agents, ranges and classes whose annotations count, and the order of detections in average
+//! precision.
 //!
-//! Every benchmark has a protocol of its own, and numbers of two protocols cannot be compared. [`EvaluationProtocol::preset`]
-//! has those of the data sets that are read here; [`ProtocolConfig`] is the same as options, with single changes on top.
+//! Every benchmark has its own protocol, and results of two protocols cannot be compared.
+//! [`EvaluationProtocol::preset`] gives those of the supported data sets; [`ProtocolConfig`] is the same as options,
+//! with single changes on top.
 
 mod config;
 mod preset;
@@ -17,26 +19,26 @@ pub use preset::{PRESETS, preset_of_layout};
 use crate::Scenario;
 use crate::ground_truth::GroundTruthRule;
 
-/// How a method is judged on a data set.
+/// Rules of evaluation on a data set.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct EvaluationProtocol {
     /// Name of the preset that it starts from.
     pub name: String,
-    /// Which objects count, and the communication range.
+    /// Classes, ranges and communication range of the ground truth.
     pub ground_truth: GroundTruthRule,
-    /// Whether the ground-truth range holds as it is. Otherwise it ends where the area of the network ends.
+    /// True to keep the ground-truth range as it is. Otherwise it is limited to the area of the network.
     pub exact_range: bool,
-    /// Which agents take part.
+    /// Kinds of agents that take part.
     pub agents: AgentKinds,
-    /// Which of them is the ego.
+    /// Choice of the ego.
     pub ego: EgoKind,
-    /// How many agents take part at most, the ego included.
+    /// Largest number of agents, the ego included.
     pub max_agents: usize,
     /// Order of detections in the average precision that the benchmark reports.
     pub ap_order: ApOrder,
 }
 
-/// Which agents of a scenario take part.
+/// Kinds of agents of a scenario that take part.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema, clap::ValueEnum)]
 #[serde(rename_all = "snake_case")]
 pub enum AgentKinds {
@@ -49,14 +51,14 @@ pub enum AgentKinds {
     Units,
 }
 
-/// Which agent of a scenario is the ego.
+/// Choice of the ego in a scenario.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema, clap::ValueEnum)]
 #[serde(rename_all = "snake_case")]
 pub enum EgoKind {
-    /// The first vehicle; the first roadside unit where there is no vehicle.
+    /// The first vehicle; the first roadside unit if there is no vehicle.
     #[default]
     Vehicle,
-    /// The first roadside unit; the first vehicle where there is none.
+    /// The first roadside unit; the first vehicle if there is none.
     Unit,
 }
 
@@ -78,8 +80,8 @@ impl EvaluationProtocol {
         preset::preset(name)
     }
 
-    /// The rule for a network that sees `area_m`: x, y, z low, then x, y, z high, metres in the ego's LiDAR frame. No
-    /// network finds what lies outside of its area, so the ground-truth range ends there, unless `exact_range` is set.
+    /// The rule for a network that covers `area_m`: x, y, z low, then x, y, z high, metres in the ego's LiDAR frame. No
+    /// network finds objects outside its area, so the ground-truth range ends there, unless `exact_range` is set.
     #[must_use]
     pub fn rule_within(&self, area_m: [f64; 6]) -> GroundTruthRule {
         if self.exact_range {
@@ -90,7 +92,7 @@ impl EvaluationProtocol {
         GroundTruthRule { x_m: within(x_m, 0), y_m: within(y_m, 1), z_m: within(z_m, 2), ..self.ground_truth }
     }
 
-    /// The scenario with the agents that take part, the ego first; none where no agent is of the kind asked for.
+    /// The scenario with the agents that take part, the ego first; none if no agent is of the requested kind.
     #[must_use]
     pub fn arrange(&self, scenario: &Scenario) -> Option<Scenario> {
         let is_unit = |index: &usize| scenario.roadside_units.contains(&scenario.agents[*index]);

@@ -2,7 +2,7 @@
 
 use super::ReadError;
 
-/// What was left out of one file.
+/// Rows that were left out of one file.
 #[derive(Debug, Default)]
 pub(super) struct Faults {
     first: Option<ReadError>,
@@ -20,7 +20,7 @@ impl Faults {
         result.map_err(|fault| self.push(fault)).ok()
     }
 
-    /// The first fault, with how many of `unit` (`row`, `scan`) are left out.
+    /// Reports the first fault, with the number of `unit`s (`row`, `scan`) left out.
     pub(super) fn report(self, unit: &str, problems: &mut Vec<ReadError>) {
         let consequence = match self.count {
             1 => format!("the {unit} is left out"),

@@ -15,8 +15,7 @@ pub(super) struct Listing {
     pub(super) files: Vec<String>,
 }
 
-/// Lists a folder. Names that are not UTF-8 are none of ours and are left out; so are links to nothing, which are files
-/// that are not there.
+/// Lists a folder. Names that are not UTF-8 are left out; so are dangling links, which count as missing files.
 pub(super) fn list(dir: &Path) -> Result<Listing, ReadError> {
     let mut listing = Listing::default();
     for entry in fs::read_dir(dir).map_err(|error| ReadError::io(dir, error))? {
@@ -57,13 +56,14 @@ pub(super) fn read_limited(path: &Path, max_bytes: u64) -> Result<Vec<u8>, ReadE
     })
 }
 
-/// Reads a text file of at most `max_bytes`. Bytes that are no UTF-8 become marks that no number has.
+/// Reads a text file of at most `max_bytes`. Bytes that are no UTF-8 become replacement characters, which no number
+/// contains.
 pub(super) fn read_text(path: &Path, max_bytes: u64) -> Result<String, ReadError> {
     let bytes = read_limited(path, max_bytes)?;
     Ok(String::from_utf8(bytes).unwrap_or_else(|error| String::from_utf8_lossy(error.as_bytes()).into_owned()))
 }
 
-/// True where a folder has a file whose name ends in `suffix`.
+/// True if a folder has a file whose name ends in `suffix`.
 pub(super) fn holds(dir: &Path, suffix: &str) -> bool {
     list(dir).is_ok_and(|listing| listing.files.iter().any(|name| name.ends_with(suffix)))
 }
@@ -73,14 +73,14 @@ pub(super) fn stems<'a>(files: &'a [String], suffix: &str) -> Vec<&'a str> {
     files.iter().filter_map(|name| name.strip_suffix(suffix)).collect()
 }
 
-/// The names by which a folder can be found from outside: as it is given, from the root on, and where it really lies. In
-/// `.` or `00` there is little of what lies above it; behind a symbolic link other things may be.
+/// Paths of a folder: as given, absolute, and canonical. `.` or `00` shows little of the folders above; a symbolic link
+/// may lead to other ones.
 pub(super) fn names_of(dir: &Path) -> impl Iterator<Item = PathBuf> {
     let others = [std::path::absolute(dir), dir.canonicalize()].into_iter().flatten();
     std::iter::once(dir.to_owned()).chain(others).filter(|name| name.file_name().is_some())
 }
 
-/// The folders that lie above one, by its [`names_of`].
+/// The folders above one, by its [`names_of`].
 pub(super) fn above(dir: &Path) -> impl Iterator<Item = PathBuf> {
     names_of(dir).filter_map(|name| name.parent().map(Path::to_owned))
 }

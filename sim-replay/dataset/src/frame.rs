@@ -1,4 +1,4 @@
-//! What one CAV measured at one capture time, with what the recording knows to be true about it.
+//! Frame: data of one CAV at one capture time, with the recording's ground truth.
 //!
 //! Every layout is read into this one frame: right-handed, metres, radians, nanoseconds (see [`protocol`]).
 
@@ -9,11 +9,11 @@ use serde::{Deserialize, Serialize};
 
 use crate::Problem;
 
-/// What an annotated object is.
+/// Class of an annotated object.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum ObjectClass {
-    /// A passenger car; also every object of datasets that do not name types.
+    /// A passenger car; also every object of data sets without types.
     Car,
     /// A van.
     Van,
@@ -36,7 +36,7 @@ impl ObjectClass {
     /// Classes of motor vehicles with at least three wheels: the default targets of detection.
     pub const VEHICLES: [Self; 4] = [Self::Car, Self::Van, Self::Truck, Self::Bus];
 
-    /// True for [`Self::VEHICLES`]. An object of unknown type is no vehicle.
+    /// True for [`Self::VEHICLES`]. An object of unknown type is not a vehicle.
     #[must_use]
     pub fn is_vehicle(self) -> bool {
         Self::VEHICLES.contains(&self)
@@ -74,52 +74,52 @@ pub struct UnknownClass(String);
 /// An annotated object.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Object {
-    /// The same for the same object in the frames of all CAVs of a scenario.
+    /// Identical for the same object in the frames of all CAVs of a scenario.
     pub id: i64,
-    /// What it is.
+    /// Class of the object.
     pub class: ObjectClass,
     /// The box: its centre, and x along its length.
     pub world_from_object: Pose,
     /// Full length, width, height in metres.
     pub size_m: [f64; 3],
-    /// Speed, metres per second, where recorded.
+    /// Speed, metres per second, if recorded.
     pub speed_mps: Option<f64>,
 }
 
 /// One sweep of one CAV.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Frame {
-    /// Who measured.
+    /// Id of the CAV.
     pub cav: CavId,
-    /// When, on the clock of the scene, nanoseconds.
+    /// Capture time on the clock of the scene, nanoseconds.
     pub capture_nanos: u64,
-    /// The sweep in the LiDAR frame. Without points where [`crate::LoadOptions::points`] was off.
+    /// The sweep in the LiDAR frame. Empty if [`crate::LoadOptions::points`] is off.
     pub points: PointCloud,
     /// Points of the file that were left out because a coordinate or intensity is not finite.
     pub dropped_points: usize,
-    /// The 4D radar's points in the LiDAR frame, where the recording has them; the fourth value as stored.
+    /// The 4D radar's points in the LiDAR frame, if recorded; the fourth value as stored.
     pub radar: Option<PointCloud>,
-    /// True pose of the LiDAR. `None` where the dataset gives no pose.
+    /// True pose of the LiDAR. `None` if the data set gives no pose.
     pub world_from_lidar: Option<Pose>,
-    /// True pose of the vehicle's own origin (not the LiDAR's), where recorded.
+    /// True pose of the vehicle's own origin (not the LiDAR's), if recorded.
     pub world_from_vehicle: Option<Pose>,
-    /// What the vehicle's GNSS and IMU filter believed its origin to be, where recorded.
+    /// Pose of the vehicle's origin estimated by its GNSS and IMU filter, if recorded.
     pub gnss_world_from_vehicle: Option<Pose>,
-    /// Forward speed in metres per second, where recorded. May be slightly negative.
+    /// Forward speed in metres per second, if recorded. May be slightly negative.
     pub speed_mps: Option<f64>,
-    /// What this CAV's annotation lists. A CAV never lists itself.
+    /// Objects in this CAV's annotation. A CAV never lists itself.
     pub objects: Vec<Object>,
-    /// All objects that the agents of the tick together are expected to find, where the data set has such a list; it stands
-    /// on the ego's frame. `None` where the lists of the agents are merged.
+    /// All objects that the agents of the tick together are expected to find, if the data set has such a list; it is
+    /// stored in the ego's frame. `None` if the lists of the agents are merged.
     pub cooperative_objects: Option<Vec<Object>>,
-    /// Parts of the frame that were left out: an object without a sound box, a field that cannot be read.
+    /// Parts of the frame that were left out: an object without a valid box, a field that cannot be read.
     pub problems: Vec<Problem>,
-    /// Which way the axes of the recording turned.
+    /// Handedness of the axes of the recording.
     pub source_handedness: Handedness,
 }
 
 impl Frame {
-    /// A frame with nothing in it.
+    /// An empty frame.
     #[must_use]
     pub fn empty(cav: CavId, capture_nanos: u64, source_handedness: Handedness) -> Self {
         Self {

@@ -1,4 +1,4 @@
-//! Files of one agent's folder: which frames are whole, which variants there are, and what lies there besides.
+//! Files of one agent's folder: complete frames, variants of the sweep, and other files.
 
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -13,17 +13,17 @@ pub(super) const RADAR: &str = "radar";
 pub(super) const PCD: &str = ".pcd";
 pub(super) const BIN: &str = ".bin";
 
-/// What lies in an agent's folder.
+/// Contents of an agent's folder.
 #[derive(Debug, Default)]
 pub(super) struct AgentFolder {
-    /// Stems with both YAML and sweep; with a sweep alone where there is no YAML at all.
+    /// Stems with both YAML and sweep; with a sweep alone if there is no YAML at all.
     pub(super) stems: BTreeSet<String>,
     pub(super) is_without_yaml: bool,
     pub(super) variants: BTreeSet<String>,
     pub(super) has_radar: bool,
 }
 
-/// True where a folder has a frame's YAML and its sweep of the given suffix.
+/// True if a folder has a frame's YAML and its sweep of the given suffix.
 pub(super) fn holds_pairs(listing: &Listing, suffix: &str) -> bool {
     let yamls: BTreeSet<&str> = yaml_stems(listing).collect();
     files::stems(&listing.files, suffix).iter().any(|stem| yamls.contains(stem))
@@ -34,13 +34,13 @@ fn yaml_stems(listing: &Listing) -> impl Iterator<Item = &str> {
     stems.filter(|stem| !NOT_FRAMES.iter().any(|text| stem.contains(text)))
 }
 
-/// Frames are numbered.
+/// True for digits: frames are numbered.
 fn is_number(stem: &str) -> bool {
     !stem.is_empty() && stem.bytes().all(|byte| byte.is_ascii_digit())
 }
 
-/// The stems of frames, and those of other files. Copies such as `000070 (1)` beside numbers are no moments; frames may
-/// have other names where most have.
+/// The stems of frames, and those of other files. Copies such as `000070 (1)` beside numbers are not frames; frames may
+/// have other names if most have.
 pub(super) fn usual_stems(all: BTreeSet<&str>) -> (BTreeSet<&str>, BTreeSet<&str>) {
     let (numbers, others): (BTreeSet<&str>, BTreeSet<&str>) = all.iter().partition(|stem| is_number(stem));
     let is_copy = |stem: &&&str| {
@@ -51,7 +51,7 @@ pub(super) fn usual_stems(all: BTreeSet<&str>) -> (BTreeSet<&str>, BTreeSet<&str
     if !numbers.is_empty() && numbers.len() >= names { (numbers, others) } else { (all, BTreeSet::new()) }
 }
 
-/// One problem for all files of other names than frames have.
+/// One problem for all files whose names differ from those of frames.
 pub(super) fn named_once(dir: &Path, strays: &[String]) -> Option<ReadError> {
     let first = strays.iter().min()?;
     let reason = format!("{} files whose names are no frame numbers are left out, first: {first}", strays.len());
@@ -59,7 +59,7 @@ pub(super) fn named_once(dir: &Path, strays: &[String]) -> Option<ReadError> {
 }
 
 impl AgentFolder {
-    /// Sorts the files of `dir`. What has to be left out goes to `problems`.
+    /// Sorts the files of `dir`. Parts that have to be left out are added to `problems`.
     pub(super) fn new(dir: &Path, listing: &Listing, suffix: &str, problems: &mut Vec<ReadError>) -> Self {
         let mut listed: BTreeSet<&str> = yaml_stems(listing).collect();
         let is_without_yaml = listed.is_empty();

@@ -1,12 +1,12 @@
-//! Which objects an ego is expected to find: the annotations of all CAVs in range, merged.
+//! Ground truth: the annotations of all CAVs in range, merged into the objects that an ego is expected to find.
 //!
 //! The rule is OpenCOOD's at test time (`opencood/data_utils/post_processor/base_postprocessor.py`,
 //! `opencood/utils/box_utils.py`): annotations of the current tick, moved by true poses, reduced to upright boxes in
 //! the ego's LiDAR frame, kept where their corners lie in range, merged by id. The ego itself is not removed: where a
 //! partner lists it, it is an object near the origin.
 //!
-//! Data sets with a cooperative annotation of a tick (DAIR-V2X, V2X-Seq) are judged by that list alone, as their public
-//! protocols do: see [`annotations`].
+//! Data sets with a cooperative annotation of a tick (DAIR-V2X, V2X-Seq) are evaluated by that list alone, as their
+//! public protocols do: see [`annotations`].
 
 use std::collections::HashSet;
 
@@ -17,7 +17,7 @@ use serde::{Deserialize, Serialize};
 use crate::class_set::ClassSet;
 use crate::frame::{Frame, Object};
 
-/// Where objects count, and whose annotations.
+/// Range, classes and agents whose annotations count.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct GroundTruthRule {
     /// Lower and upper end of x in the ego's LiDAR frame, metres, both included.
@@ -28,7 +28,7 @@ pub struct GroundTruthRule {
     pub z_m: [f64; 2],
     /// CAVs farther than this from the ego, in the plane, do not contribute, metres.
     pub comm_range_m: f64,
-    /// How many of a box's 8 corners must lie within x, y and z.
+    /// Number of a box's 8 corners that must lie within x, y and z.
     pub min_corners: usize,
     /// Classes of the objects that count.
     pub classes: ClassSet,
@@ -54,24 +54,24 @@ impl GroundTruthRule {
         classes: ClassSet::ALL_BUT_PEDESTRIANS,
     };
 
-    /// Whether enough corners lie in range, and all of them in x and y.
+    /// True if enough corners lie in range, and all of them in x and y.
     #[must_use]
     pub fn keeps(&self, box3d: &Box3d) -> bool {
         let corners = box3d.corners();
         let within = |value: f64, [low, high]: [f64; 2]| low <= value && value <= high;
         let in_plane = |&[x, y, _]: &[f64; 3]| within(x, self.x_m) && within(y, self.y_m);
         let inside = corners.iter().filter(|corner| in_plane(corner) && within(corner[2], self.z_m)).count();
-        // The second test is the reference's own, on x and y alone, after merging. It decides only where fewer than
-        // all corners pass the first one.
+        // The second test is the reference's own, on x and y alone, after merging. It decides only if fewer than all
+        // corners pass the first one.
         inside >= self.min_corners && corners.iter().all(in_plane)
     }
 }
 
-/// The objects of one tick in the frame of the ego's LiDAR, by id, in the order in which they are first met: the ego's
-/// own annotation first, then the other agents' in the order of `frames_of_tick`.
+/// The objects of one tick in the frame of the ego's LiDAR, by id, in the order of first occurrence: the ego's own
+/// annotation first, then the other agents' in the order of `frames_of_tick`.
 ///
-/// `frames_of_tick` are the frames of all agents at the tick, `ego_index` is the ego's place among them. Without a pose
-/// of the ego there is nothing to merge in.
+/// `frames_of_tick` are the frames of all agents at the tick, `ego_index` is the ego's index among them. Without a pose
+/// of the ego the result is empty.
 #[must_use]
 pub fn merge(frames_of_tick: &[&Frame], ego_index: usize, rule: &GroundTruthRule) -> Vec<(i64, Box3d)> {
     let Some(ego) = frames_of_tick.get(ego_index) else { return Vec::new() };
@@ -79,7 +79,7 @@ pub fn merge(frames_of_tick: &[&Frame], ego_index: usize, rule: &GroundTruthRule
     let ego_from_world = world_from_ego.isometry().inverse();
     let annotations = annotations(frames_of_tick);
     let contributors = match frames_of_tick.iter().position(|frame| frame.cooperative_objects.is_some()) {
-        // The list is about the tick, whoever is in range.
+        // The list belongs to the tick, regardless of the agents in range.
         Some(holder) => vec![holder],
         None => contributors(frames_of_tick, ego_index, rule.comm_range_m),
     };
@@ -96,7 +96,7 @@ pub fn merge(frames_of_tick: &[&Frame], ego_index: usize, rule: &GroundTruthRule
     merged
 }
 
-/// The objects that each frame of a tick contributes to the truth: what its agent lists. Where a frame holds the
+/// The objects that each frame of a tick contributes to the ground truth: those its agent lists. If a frame holds the
 /// cooperative annotation of the tick, it contributes that one, and the others nothing.
 #[must_use]
 pub fn annotations<'a>(frames_of_tick: &[&'a Frame]) -> Vec<&'a [Object]> {

@@ -6,9 +6,9 @@
 /// A signed number of 8 bytes, little-endian, and a double, as messages of type.
 const I64: [u8; 12] = [0x10, 0x08, 0, 0, 8, 0, 0, 0, 0, 0, 64, 0];
 const F64: [u8; 20] = [0x11, 0x20, 0x3f, 0, 8, 0, 0, 0, 0, 0, 64, 0, 52, 11, 0, 52, 0xff, 0x03, 0, 0];
-/// An address that leads nowhere.
+/// An undefined address.
 const UNDEFINED: [u8; 8] = [0xff; 8];
-/// Where the root group begins, behind the superblock.
+/// Offset of the root group, after the superblock.
 const ROOT: usize = 96;
 
 /// A message of an object header: type, and data padded to 8 bytes.
@@ -70,7 +70,7 @@ pub fn poses_file(stamps: &[i64], poses: &[[f64; 12]]) -> Vec<u8> {
     let root_of = |a, b| object_header(&[link_info.clone(), link("valid_timestamps", a), link("poses", b)]);
     let stamp_header = |data| dataset_header(&[stamps.len() as u64], &I64, data, stamp_bytes.len());
     let pose_header = |data| dataset_header(&[poses.len() as u64, 12], &F64, data, pose_bytes.len());
-    // Headers have the same length wherever they point.
+    // Headers have the same length for every address.
     let first = ROOT + root_of(0, 0).len();
     let second = first + stamp_header(0).len();
     let data = second + pose_header(0).len();

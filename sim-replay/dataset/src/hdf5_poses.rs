@@ -1,4 +1,4 @@
-//! The HDF5 files in which LightLoc keeps the poses of a localization sequence.
+//! HDF5 files of LightLoc with the poses of a localization sequence.
 //!
 //! Datasets `valid_timestamps` (`n`, microseconds) and `poses` (`n x 12`). LightLoc leaves out the first and the last
 //! five entries (`datasets/lidarloc.py`), and so does this reader.
@@ -18,7 +18,7 @@ const MAX_BYTES: usize = 128 << 20;
 /// Entries left out at either end.
 const TRIMMED: usize = 5;
 
-/// How the 12 numbers of a pose are arranged.
+/// Arrangement of the 12 numbers of a pose.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum RowOrder {
     /// A 3x4 matrix row by row, translation at 3, 7, 11 (Oxford, NCLT).
@@ -27,7 +27,7 @@ pub(super) enum RowOrder {
     RotationFirst,
 }
 
-/// Poses by time stamp in microseconds, in the axes of the file. Entries that cannot be right are left out and named.
+/// Poses by time stamp in microseconds, in the axes of the file. Invalid entries are left out and reported.
 pub(super) fn read(
     path: &Path,
     order: RowOrder,
@@ -128,7 +128,7 @@ pub(super) mod tests {
     const ROTATION_FIRST: [f64; 12] = [0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 4.0, 5.0, 6.0];
 
     #[test]
-    fn both_arrangements_say_the_same_and_the_ends_are_left_out() {
+    fn both_arrangements_give_the_same_and_the_ends_are_left_out() {
         let stamps: Vec<i64> = (0..12).map(|index| 1_326_652_795_280_148 + index).collect();
         let by_matrix = parse(file(&stamps, &[MATRIX; 12]), RowOrder::Matrix).unwrap();
         let by_rotation = parse(file(&stamps, &[ROTATION_FIRST; 12]), RowOrder::RotationFirst).unwrap();

@@ -1,4 +1,4 @@
-//! JSON of one frame, and values that know their place for messages.
+//! JSON of one frame, and values with their position for error messages.
 
 use std::path::Path;
 
@@ -17,7 +17,7 @@ pub(super) fn read(path: &Path) -> Result<Value, ReadError> {
     })
 }
 
-/// A value together with where it was found: what readers take numbers and texts from.
+/// A value with its position in the document; readers take numbers and texts from it.
 #[derive(Debug, Clone)]
 pub(super) struct Field<'a> {
     path: &'a Path,
@@ -65,7 +65,7 @@ impl<'a> Field<'a> {
         Ok(found.map(|value| self.child(key, value)))
     }
 
-    /// An entry that must be there.
+    /// A required entry.
     pub(super) fn required(&self, key: &str) -> Result<Self, ReadError> {
         self.optional(key)?.ok_or_else(|| self.child(key, self.value).error("missing"))
     }
@@ -103,7 +103,7 @@ impl<'a> Field<'a> {
         }
     }
 
-    /// Exactly `N` finite numbers, whichever way they are nested: `[x, y, z]` and `[[x], [y], [z]]` are the same.
+    /// Exactly `N` finite numbers, regardless of nesting: `[x, y, z]` and `[[x], [y], [z]]` are the same.
     pub(super) fn numbers<const N: usize>(&self) -> Result<[f64; N], ReadError> {
         let mut numbers = Vec::with_capacity(N);
         self.flatten(N, &mut numbers)?;
@@ -122,7 +122,7 @@ impl<'a> Field<'a> {
     }
 }
 
-/// What kind of thing a value is, for messages.
+/// Kind of a value, for messages.
 fn kind(value: &Value) -> String {
     match value {
         Value::Null => "nothing".into(),
@@ -168,7 +168,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_missing_or_of_another_kind_is_named() {
+    fn missing_and_mistyped_values_are_reported() {
         let value = json!([{"x": null, "y": "", "z": {}}]);
         let entry = Field::entry(Path::new("a.json"), 3, &value[0]);
         for key in ["x", "y", "other"] {

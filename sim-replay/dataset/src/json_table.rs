@@ -15,10 +15,10 @@ use super::json::Field;
 const BUFFER_BYTES: usize = 1 << 20;
 /// Largest row, bytes.
 const MAX_ROW_BYTES: usize = 1 << 20;
-/// Rows that are named where they cannot be used; further ones are counted.
+/// Unusable rows that are reported one by one; further ones are counted.
 const MAX_PROBLEMS: usize = 20;
 
-/// Tokens of a row by which most rows of large tables are told from those that are needed, before the rest is parsed.
+/// Tokens of a row, by which needed rows of large tables are selected before the rest is parsed.
 #[derive(Debug, Default, Deserialize)]
 #[serde(default)]
 pub(super) struct Keys<'a> {
@@ -29,13 +29,13 @@ pub(super) struct Keys<'a> {
     pub(super) is_key_frame: Option<bool>,
 }
 
-/// Reads a table: a file of at most `max_bytes` that holds one list. Its rows are handed over one at a time, the list is
-/// never in memory as a whole. A row that cannot be used, or where the file breaks off, is a problem, and the others count.
+/// Reads a table: a file of at most `max_bytes` that holds one list. Its rows are passed on one at a time; the list is
+/// never in memory as a whole. An unusable row, or a truncated file, is a problem, and the other rows are used.
 ///
-/// Returns how many rows could be used.
+/// Returns the number of usable rows.
 ///
 /// # Errors
-/// Where the file cannot be read, is larger, or is broken before its first row that can be used.
+/// If the file cannot be read, is larger, or is broken before its first usable row.
 pub(super) fn read(
     path: &Path,
     max_bytes: u64,
@@ -45,7 +45,7 @@ pub(super) fn read(
 ) -> Result<usize, ReadError> {
     let (mut used, mut unusable, mut first_problems) = (0, 0, Vec::new());
     let whole = for_each_row(path, max_bytes, |index, raw| {
-        // A row without sound keys is needed for its message.
+        // A row without valid keys is kept for its error message.
         if serde_json::from_slice(raw).is_ok_and(|keys: Keys<'_>| !is_needed(&keys)) {
             return;
         }
@@ -60,7 +60,7 @@ pub(super) fn read(
         }
     });
     if unusable > first_problems.len() {
-        let reason = format!("{unusable} entries cannot be used: left out; the first {MAX_PROBLEMS} are named");
+        let reason = format!("{unusable} entries cannot be used: left out; the first {MAX_PROBLEMS} are listed");
         first_problems.push(ReadError::malformed(path, reason));
     }
     problems.append(&mut first_problems);
@@ -81,8 +81,8 @@ fn parse_row(path: &Path, index: usize, raw: &[u8]) -> Result<Value, ReadError> 
     })
 }
 
-/// Hands over the entries of the list as they stand in the file. An entry need not be sound: it ends where its brackets are
-/// closed.
+/// Passes on the entries of the list in the order of the file. An entry need not be valid: it ends when its brackets
+/// are closed.
 fn for_each_row(path: &Path, max_bytes: u64, mut entry: impl FnMut(usize, &[u8])) -> Result<(), ReadError> {
     let file = File::open(path).map_err(|error| ReadError::io(path, error))?;
     let size = file.metadata().map_err(|error| ReadError::io(path, error))?.len();
@@ -90,7 +90,7 @@ fn for_each_row(path: &Path, max_bytes: u64, mut entry: impl FnMut(usize, &[u8])
         let reason = format!("{size} bytes: larger than {max_bytes} bytes, the most that is read");
         return Err(ReadError::malformed(path, reason));
     }
-    // The limit holds as well for what grows while it is read.
+    // The limit also holds for a file that grows while it is read.
     let mut reader = BufReader::with_capacity(BUFFER_BYTES, file.take(max_bytes));
     let mut list = RowSplitter::default();
     loop {
@@ -110,12 +110,12 @@ struct RowSplitter {
     /// The entry that has begun.
     entry: Vec<u8>,
     count: usize,
-    /// Brackets that are open: 0 before the list and behind it.
+    /// Depth of open brackets: 0 before and after the list.
     depth: usize,
     is_string: bool,
     is_escaped: bool,
     is_over: bool,
-    /// Lines that are over.
+    /// Number of completed lines.
     lines: u64,
 }
 
@@ -189,7 +189,7 @@ impl RowSplitter {
 mod tests {
     use super::*;
 
-    /// What was read of a table of numbers, the problems, and the result.
+    /// Values read from a table of numbers, the problems, and the result.
     fn read_numbers(text: &str, max_bytes: u64) -> (Vec<u64>, Vec<String>, Result<usize, String>) {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("table.json");
@@ -218,11 +218,11 @@ mod tests {
         let many = format!("[{}]", vec!["{}"; 50].join(","));
         let (_, problems, result) = read_numbers(&many, 1000);
         assert_eq!((problems.len(), result), (21, Ok(0)));
-        assert_eq!(problems[20], ": 50 entries cannot be used: left out; the first 20 are named");
+        assert_eq!(problems[20], ": 50 entries cannot be used: left out; the first 20 are listed");
     }
 
     #[test]
-    fn a_row_that_is_no_json_costs_itself_alone() {
+    fn a_row_that_is_no_json_costs_only_itself() {
         let (numbers, problems, result) = read_numbers(r#"[{"n": 1}, {"n": NaN}, , {"n": "a]\"b"}, {"n": 4}]"#, 100);
         assert_eq!((numbers, result), (vec![1, 4], Ok(2)));
         assert_eq!(problems.len(), 3);
@@ -231,7 +231,7 @@ mod tests {
     }
 
     #[test]
-    fn a_table_that_breaks_off_gives_what_came_before() {
+    fn a_truncated_table_gives_its_complete_rows() {
         let (numbers, problems, result) = read_numbers("[{\"n\": 1},\n {\"n\"", 100);
         assert_eq!((numbers, result), (vec![1], Ok(1)));
         assert_eq!(problems, [":2: ends within the list, behind 1 entries"]);

@@ -1,6 +1,6 @@
 //! KITTI object detection: single frames with boxes, `{training,testing}/{velodyne,calib,label_2}`.
 //!
-//! The frames have nothing to do with each other, and no pose: each is its own world, with the LiDAR at its origin.
+//! The frames are independent and have no pose: each is its own world, with the LiDAR at its origin.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -15,7 +15,7 @@ use super::{FrameSource, Layout, OpenOptions, Problem, ReadError, Scenario, Tick
 use crate::frame::{Frame, Object, ObjectClass};
 use crate::pcd::PcdCloud;
 
-/// Numbers behind the type in a line of labels; detections have a score as well.
+/// Numbers after the type in a line of labels; detections have a score as well.
 const LABEL_NUMBERS: usize = 14;
 /// Largest size of an object, metres.
 const MAX_SIZE_M: f64 = 100.0;
@@ -86,7 +86,8 @@ impl Split {
     }
 }
 
-/// The labelled objects in the LiDAR frame, and what was left out. `DontCare` regions have no box and are not counted.
+/// The labelled objects in the LiDAR frame, and the faults of those left out. `DontCare` regions have no box and are
+/// not counted.
 fn objects(path: &Path, lidar_from_camera: &Isometry3<f64>) -> Result<(Vec<Object>, Vec<Problem>), ReadError> {
     let (mut objects, mut problems) = (Vec::new(), Vec::new());
     for (line, text) in kitti_text::lines(path)? {
@@ -116,7 +117,7 @@ fn object(
     id: i64,
     lidar_from_camera: &Isometry3<f64>,
 ) -> Result<Object, ReadError> {
-    // Not every file's first word is short.
+    // The first word of an arbitrary file may be long.
     let field: String = kind.chars().take(40).collect();
     let malformed = |reason: String| kitti_text::malformed(path, line, Some(&field), reason);
     let count = numbers.split_ascii_whitespace().count();
@@ -136,11 +137,11 @@ fn object(
     Ok(Object { id, class, world_from_object, size_m, speed_mps: None })
 }
 
-/// The label's place is the middle of the bottom face in the camera frame (x right, y down, z forward); `rotation_y`
+/// The label's position is the centre of the bottom face in the camera frame (x right, y down, z forward); `rotation_y`
 /// turns the length from x towards -z.
 fn camera_from_object(bottom: [f64; 3], height: f64, rotation_y: f64) -> Isometry3<f64> {
     let (sin, cos) = rotation_y.sin_cos();
-    // Columns: where the object's length, left side and top point.
+    // Columns: directions of the object's length, left side and top.
     let rotation = Matrix3::new(cos, sin, 0.0, 0.0, 0.0, -1.0, -sin, cos, 0.0);
     let rotation = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(rotation));
     let [x, y, z] = bottom;
@@ -191,7 +192,7 @@ mod tests {
     }
 
     #[test]
-    fn a_bad_label_loses_its_object_alone_and_names_line_and_field() {
+    fn a_bad_label_loses_only_its_object_and_gives_line_and_field() {
         let sound = "Car 0 0 0 0 0 0 0 1.5 1.6 4.0 2.0 1.7 9.7 0\n";
         for (bad, field, expected) in [
             ("Van 0 0 0", "Van", "3 numbers, expected 14: the object is left out"),
@@ -222,7 +223,11 @@ mod tests {
         let dir = build("Ufo 0 0 0 0 0 0 0 1.5 1.6 4.0 2.0 1.7 9.7 0\n");
         let frame = crate::open(dir.path()).unwrap().scenarios[0].load(0, 0, &LoadOptions::default()).unwrap();
         assert_eq!(frame.objects[0].class, ObjectClass::Other);
-        assert!(frame.problems[0].message.contains("type: \"Ufo\" is no known type of object"), "{:?}", frame.problems);
+        assert!(
+            frame.problems[0].message.contains("type: \"Ufo\" is an unknown type of object"),
+            "{:?}",
+            frame.problems
+        );
     }
 
     #[test]
@@ -239,6 +244,6 @@ mod tests {
         let dir = build("");
         fs::rename(dir.path().join("training/velodyne/000000.bin"), dir.path().join("training/velodyne/000000.pcd"))
             .unwrap();
-        assert!(crate::open(dir.path()).unwrap_err().to_string().contains("no known layout"));
+        assert!(crate::open(dir.path()).unwrap_err().to_string().contains("no supported layout"));
     }
 }

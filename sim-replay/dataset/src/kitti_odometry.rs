@@ -20,7 +20,7 @@ use crate::pcd::PcdCloud;
 #[derive(Debug)]
 struct Sequence {
     dir: PathBuf,
-    /// Poses of the LiDAR by scan number, where the sequence has poses and the scan a sound one.
+    /// Poses of the LiDAR by scan number, if the sequence has poses and the scan a valid one.
     world_from_lidar: Option<Vec<Option<Pose>>>,
     sweeps: Sweeps,
 }
@@ -30,7 +30,7 @@ pub(super) fn is_sequence(dir: &Path) -> bool {
     dir.join("calib.txt").is_file() && files::holds(&dir.join("velodyne"), ".bin")
 }
 
-/// Opens a sequence. Scans without time or pose are left out where others have them, and named with their number.
+/// Opens a sequence. Scans without time or pose are left out if others have them, and reported with their number.
 pub(super) fn open(
     root: &Path,
     dir: &Path,
@@ -66,7 +66,7 @@ fn scans(velodyne: &Path, problems: &mut Vec<ReadError>) -> Result<Vec<(usize, S
     Ok(scans)
 }
 
-/// What a file says of all scans, or a problem and nothing.
+/// Values that a file gives for all scans; if it cannot be read, a problem and nothing.
 fn or_without<T>(what: &str, read: Result<Option<T>, ReadError>, problems: &mut Vec<ReadError>) -> Option<T> {
     read.unwrap_or_else(|error| {
         problems.push(error.with_consequence(&format!("the sequence is read without {what}")));
@@ -74,7 +74,8 @@ fn or_without<T>(what: &str, read: Result<Option<T>, ReadError>, problems: &mut 
     })
 }
 
-/// Leaves out the scans that the rows of `path` end before, or whose row could not be read, which is known already.
+/// Leaves out the scans beyond the last row of `path`, and those whose row could not be read, which is already
+/// reported.
 fn keep_those_with<T>(
     scans: &mut Vec<(usize, String)>,
     path: &Path,
@@ -117,7 +118,7 @@ fn scan_number(velodyne: &Path, stem: &str) -> Result<usize, ReadError> {
     stem.parse().map_err(|_| ReadError::malformed(&path, format!("{stem:?} is no scan number")))
 }
 
-/// Where the sequence's poses are: beside the scans, or in the release's common folder.
+/// Path of the sequence's poses: beside the scans, or in the release's common folder.
 fn poses_path(dir: &Path) -> Option<PathBuf> {
     let beside = ["poses.txt", "poses_cam0.txt"].map(|name| dir.join(name)).into_iter().find(|path| path.is_file());
     let common = |dir: PathBuf| {
@@ -175,7 +176,7 @@ mod tests {
     use super::*;
     use crate::{Dataset, LoadOptions};
 
-    /// The camera looks along x of the LiDAR: x right, y down, z forward.
+    /// The camera faces x of the LiDAR: x right, y down, z forward.
     const TR: &str = "Tr: 0 -1 0 0 0 0 -1 0 1 0 0 0\n";
 
     fn build(root: &Path, name: &str, poses_at: &str, poses: &str) {
@@ -247,7 +248,7 @@ mod tests {
     }
 
     #[test]
-    fn a_bad_pose_loses_its_scan_alone() {
+    fn a_bad_pose_loses_only_its_scan() {
         let dir = tempfile::tempdir().unwrap();
         build(dir.path(), ".", "poses.txt", "1 0 0 0 0 1 0 0 0 0 -1 0\n1 0 0 0 0 1 0 0 0 0 1 0\n");
         fs::write(dir.path().join("velodyne/000001 (1).bin"), [0; 16]).unwrap();
@@ -276,7 +277,7 @@ mod tests {
         fs::create_dir(dir.path().join("velodyne")).unwrap();
         fs::write(dir.path().join("velodyne/000000.pcd"), "").unwrap();
         fs::write(dir.path().join("calib.txt"), TR).unwrap();
-        assert!(crate::open(dir.path()).unwrap_err().to_string().contains("no known layout"));
+        assert!(crate::open(dir.path()).unwrap_err().to_string().contains("no supported layout"));
     }
 
     fn stems(dataset: &Dataset) -> Vec<&str> {

@@ -15,7 +15,7 @@ const MAX_BYTES: u64 = 32 << 20;
 #[derive(Debug)]
 pub(super) struct Calibration {
     path: PathBuf,
-    /// Name, line and what follows the name.
+    /// Name, line and the text after the name.
     entries: Vec<(String, u64, String)>,
 }
 
@@ -26,7 +26,7 @@ pub(super) fn lines(path: &Path) -> Result<Vec<(u64, String)>, ReadError> {
     Ok(numbered.map(|(number, line)| (number, line.to_owned())).collect())
 }
 
-/// One value per line; a line that cannot be read has none and goes to `faults`.
+/// One value per line; a line that cannot be read has none and is added to `faults`.
 pub(super) fn rows<T>(
     path: &Path,
     faults: &mut Faults,

@@ -1,4 +1,4 @@
-//! Table of the layouts that are read: name, data sets, and the files that decide. Messages and `--help` are made from it.
+//! Table of the supported layouts: name, data sets, and the files that identify them. Messages and `--help` use it.
 
 use std::fmt::Write;
 
@@ -36,7 +36,7 @@ pub enum Layout {
     Recording,
 }
 
-/// Description of a layout for people.
+/// Description of a layout for users.
 #[derive(Debug, Clone, Copy)]
 pub struct LayoutDescription {
     /// The layout.
@@ -45,7 +45,7 @@ pub struct LayoutDescription {
     pub name: &'static str,
     /// The data sets that are published in it.
     pub data_sets: &'static str,
-    /// The files that decide for it, relative to a scenario's folder or the root of the data set.
+    /// The files that identify it, relative to a scenario's folder or the root of the data set.
     pub files: &'static str,
 }
 
@@ -53,7 +53,7 @@ const fn row(layout: Layout, name: &'static str, data_sets: &'static str, files:
     LayoutDescription { layout, name, data_sets, files }
 }
 
-/// All layouts, in the order in which a folder is tried.
+/// All layouts, in the order in which they are tried on a folder.
 pub const LAYOUTS: [LayoutDescription; 13] = [
     row(
         Layout::Recording,
@@ -150,7 +150,7 @@ impl Layout {
     }
 }
 
-/// One line per layout: name, data sets in brackets, and the files that decide.
+/// One line per layout: name, data sets in brackets, and the files that identify it.
 #[must_use]
 pub fn layouts_text() -> String {
     let mut text = String::new();

@@ -1,4 +1,4 @@
-//! Account of what a reading pass left out: counts by kind, and the findings behind them.
+//! Account of data left out while reading: counts by kind, and the findings behind them.
 
 use std::collections::BTreeSet;
 use std::fmt;
@@ -10,27 +10,28 @@ use crate::frame::Frame;
 use support::cli::Outcome;
 use support::output;
 
-/// Findings that are kept; further ones are only counted.
+/// Largest number of findings kept; further ones are only counted.
 const KEPT: usize = 1000;
 
-/// What was left out of a data set while its frames were used.
+/// Data left out while the frames of a data set were used.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct LeftOut {
     /// Ticks of the ego without a result, because its own frame cannot be read.
     pub ticks: u64,
     /// Frames of other agents that cannot be read: the agent counts as absent there.
     pub frames: u64,
-    /// Objects and other parts of frames that cannot be right.
+    /// Invalid objects and other parts of frames.
     pub parts: u64,
-    /// Frames of other agents that do not exist at the ego's ticks: they came later or have left. No fault.
+    /// Frames of other agents that do not exist at the ego's ticks, because they joined later or have left. Not a
+    /// fault.
     pub absent_frames: u64,
-    /// Files and folders of the data set that are not used, found when it was opened.
+    /// Unused files and folders of the data set, found when it was opened.
     pub files: u64,
     problems: BTreeSet<Problem>,
 }
 
 impl LeftOut {
-    /// Adds what was found when the data set was opened.
+    /// Adds the findings of opening the data set.
     pub fn add_files<'a>(&mut self, problems: impl IntoIterator<Item = &'a super::ReadError>) {
         for problem in problems {
             self.files += 1;
@@ -38,7 +39,7 @@ impl LeftOut {
         }
     }
 
-    /// Adds what a tick lacks.
+    /// Adds the missing and unreadable frames of a tick.
     pub fn add_tick(&mut self, loaded: &LoadedTick) {
         self.absent_frames += loaded.absent as u64;
         loaded.frames.iter().for_each(|(_, frame)| self.add_parts(frame));
@@ -55,7 +56,7 @@ impl LeftOut {
         self.keep(problem);
     }
 
-    /// Adds the parts that a frame was read without.
+    /// Adds the parts left out of a frame.
     pub fn add_parts(&mut self, frame: &Frame) {
         self.parts += frame.problems.len() as u64;
         frame.problems.iter().for_each(|problem| self.keep(problem.clone()));
@@ -71,18 +72,18 @@ impl LeftOut {
         other.problems.iter().for_each(|problem| self.keep(problem.clone()));
     }
 
-    /// Whether nothing was lost. Absent agents are no loss.
+    /// True if nothing was lost. Absent agents are no loss.
     #[must_use]
     pub fn is_nothing(&self) -> bool {
         self.ticks + self.frames + self.parts + self.files == 0
     }
 
-    /// The findings, each once, at most 1,000.
+    /// The findings without duplicates, at most 1,000.
     pub fn problems(&self) -> impl Iterator<Item = &Problem> {
         self.problems.iter()
     }
 
-    /// Prints the findings to standard error; the outcome of a command that lost no other data.
+    /// Prints the findings to standard error; returns the outcome of a command that lost no other data.
     pub fn print(&self) -> Outcome {
         self.problems().for_each(|problem| output::note(format_args!("left out: {}", problem.message)));
         Outcome::of(!self.is_nothing())
@@ -96,7 +97,7 @@ impl LeftOut {
 }
 
 impl fmt::Display for LeftOut {
-    /// One line, empty where nothing is missing.
+    /// One line, empty if nothing is missing.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let counts = [
             (self.ticks, "ticks (the ego's frame cannot be read)"),
@@ -133,7 +134,7 @@ mod tests {
     }
 
     #[test]
-    fn losses_and_absences_are_told_apart() {
+    fn losses_and_absent_frames_are_distinguished() {
         let mut left_out = LeftOut::default();
         let loaded = LoadedTick { frames: vec![(0, frame(&[]))], unreadable: vec![], absent: 2 };
         left_out.add_tick(&loaded);

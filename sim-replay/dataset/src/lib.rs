@@ -1,4 +1,4 @@
-//! Datasets on disk, whatever their layout, as scenarios of agents and ticks.
+//! Data sets on disk, in any supported layout, as scenarios of agents and ticks.
 //!
 //! ```no_run
 //! # fn main() -> Result<(), dataset::ReadError> {
@@ -80,14 +80,14 @@ pub struct Dataset {
     pub layout: Layout,
     /// Its scenarios, in text order of their names.
     pub scenarios: Vec<Scenario>,
-    /// What is wrong with it and could be left out: missing files, folders that are not understood.
+    /// Faults that did not prevent opening: missing files, folders that cannot be interpreted.
     pub problems: Vec<ReadError>,
 }
 
-/// One moment of a scenario.
+/// One capture time of a scenario.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Tick {
-    /// The name of the moment's files, without suffix: a tick counter or a time stamp, by layout.
+    /// The name of the tick's files, without suffix: a tick counter or a time stamp, by layout.
     pub stem: String,
     /// Capture time on the scene's clock, nanoseconds.
     pub capture_nanos: u64,
@@ -96,45 +96,45 @@ pub struct Tick {
 /// A frame that one agent lacks.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct MissingFrame {
-    /// Who lacks it.
+    /// The agent without the frame.
     pub agent: CavId,
     /// Its stem.
     pub stem: String,
 }
 
-/// Some vehicles on the way together.
+/// Vehicles (and roadside units) driving at the same time.
 #[derive(Debug, Clone)]
 pub struct Scenario {
     /// Name: its path below the folder that was opened, or that folder's own name.
     pub name: String,
-    /// The agents, ego first: in text order, a roadside unit that would come first last.
+    /// The agents, ego first: in text order, except that a roadside unit that would come first comes last.
     pub agents: Vec<CavId>,
-    /// The ego's moments, in order. Other agents take part where they have a frame, see [`Self::is_present`].
+    /// The ego's ticks, in order. Other agents take part where they have a frame, see [`Self::is_present`].
     pub ticks: Vec<Tick>,
-    /// Frames that some agents have and others lack. Where the ego lacks one there is no tick.
+    /// Frames that some agents have and others lack. If the ego lacks one there is no tick.
     pub missing: Vec<MissingFrame>,
-    /// Those of `agents` that stand beside the road.
+    /// Those of `agents` that are roadside units.
     pub roadside_units: Vec<CavId>,
-    /// Variants of the LiDAR sweep beside the plain one, for example `fog_0.060`.
+    /// Variants of the LiDAR sweep other than the plain one, for example `fog_0.060`.
     pub lidar_variants: Vec<String>,
-    /// Whether there are 4D radar points.
+    /// True if there are 4D radar points.
     pub has_radar: bool,
     /// Layout of this scenario's files.
     pub layout: Layout,
-    /// Which way the axes of the recording turned.
+    /// Handedness of the axes of the recording.
     pub source_handedness: Handedness,
     absences: Absences,
     source: Arc<dyn FrameSource>,
 }
 
-/// What to read of a frame.
+/// Options of reading a frame.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct LoadOptions {
     /// A variant of [`Scenario::lidar_variants`] in place of the plain sweep.
     pub lidar_variant: Option<String>,
-    /// Whether to read the LiDAR's points. Off, only poses and objects are read.
+    /// True to read the LiDAR's points. If false, only poses and objects are read.
     pub points: bool,
-    /// Whether to read the radar's points.
+    /// True to read the radar's points.
     pub radar: bool,
 }
 
@@ -144,26 +144,26 @@ impl Default for LoadOptions {
     }
 }
 
-/// How a layout finds and reads its frames, in our conventions.
+/// Reader of a layout's frames, in the conventions of [`protocol`].
 trait FrameSource: std::fmt::Debug + Send + Sync {
-    /// Reads all of a frame but its points.
+    /// Reads a frame without its points.
     fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame, ReadError>;
 
     /// Reads the LiDAR's points, the plain sweep or a variant.
     fn points(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> Result<PcdCloud, ReadError>;
 
-    /// Reads the radar's points. Asked only of scenarios that have them.
+    /// Reads the radar's points. Called only for scenarios that have them.
     fn radar(&self, agent: &CavId, tick: &Tick) -> Result<PcdCloud, ReadError> {
         let path = self.points_path(agent, tick, None);
         Err(ReadError::malformed(&path, "there are no radar points beside it"))
     }
 
-    /// The file that tells the pose and objects of this frame alone, in layouts that have one.
+    /// The file with the pose and objects of this frame alone, in layouts that have one.
     fn annotation_path(&self, _agent: &CavId, _tick: &Tick) -> Option<PathBuf> {
         None
     }
 
-    /// The file that the LiDAR's points come from.
+    /// The file with the LiDAR's points.
     fn points_path(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> PathBuf;
 }
 
@@ -171,7 +171,7 @@ impl Scenario {
     /// Reads the frame of an agent at a tick, by their indices in [`Self::agents`] and [`Self::ticks`].
     ///
     /// # Errors
-    /// [`ReadError`] when there is no such agent, tick or variant, and when a file is missing or malformed.
+    /// [`ReadError`] if there is no such agent, tick or variant, and if a file is missing or malformed.
     pub fn load(&self, agent_index: usize, tick_index: usize, options: &LoadOptions) -> Result<Frame, ReadError> {
         let (agent, tick) = self.frame_of(agent_index, tick_index)?;
         let mut frame = self.source.frame(agent, tick)?;
@@ -216,10 +216,10 @@ impl Scenario {
         self.source.points(agent, tick, variant)
     }
 
-    /// The file that a frame's LiDAR points come from.
+    /// The file with a frame's LiDAR points.
     ///
     /// # Errors
-    /// [`ReadError::NoSuch`] when there is no such agent or tick.
+    /// [`ReadError::NoSuch`] if there is no such agent or tick.
     pub fn points_path(
         &self,
         agent_index: usize,
@@ -250,12 +250,12 @@ impl Scenario {
     }
 }
 
-/// The vehicle of a layout that does not name it.
+/// Id of the vehicle in a layout that does not name it.
 fn single_vehicle_id() -> CavId {
     CavId::new("0").expect("a digit is an identifier")
 }
 
-/// A scenario of a layout that knows one vehicle and does not name it.
+/// A scenario of a layout with one unnamed vehicle.
 fn single_vehicle(name: String, layout: Layout, ticks: Vec<Tick>, source: Arc<dyn FrameSource>) -> Scenario {
     Scenario {
         name,

@@ -1,4 +1,4 @@
-//! Which data it is, in one line.
+//! Fingerprints of a data set: SHA-256 over its listing and its contents.
 
 use std::fs::File;
 use std::io::{self, Read, Seek, SeekFrom};
@@ -12,13 +12,14 @@ use sha2::{Digest, Sha256};
 use super::{Scenario, Tick};
 use support::bounded_file;
 
-/// Bytes at the beginning and at the end of a point cloud that count: its header, and points that differ from sweep to sweep.
+/// Bytes hashed at the beginning and at the end of a point cloud: its header, and points that differ from sweep to
+/// sweep.
 const EDGE_BYTES: usize = 1024;
-/// Largest file of annotations that counts, bytes: as much as the reader of any layout takes.
+/// Largest file of annotations that is hashed, bytes: the limit of the readers.
 const MAX_ANNOTATION_BYTES: u64 = 32 << 20;
 
-/// SHA-256 over names, agents and capture times, in hexadecimal digits: the same for the same listing wherever it lies.
-/// No file is opened; see [`content_sha256`] for what is in them.
+/// SHA-256 over names, agents and capture times, in hexadecimal digits: independent of the path of the data set. No
+/// file is opened; see [`content_sha256`] for the contents.
 #[must_use]
 pub fn listing_sha256<'a>(scenarios: impl IntoIterator<Item = &'a Scenario>) -> String {
     let mut hash = Sha256::new();
@@ -26,12 +27,12 @@ pub fn listing_sha256<'a>(scenarios: impl IntoIterator<Item = &'a Scenario>) -> 
     digits(hash)
 }
 
-/// SHA-256 over the listing and over what its files hold, in hexadecimal digits, for model cards.
+/// SHA-256 over the listing and the contents of its files, in hexadecimal digits, for model cards.
 ///
-/// Of every frame's points: the size of the file, its first and its last kilobyte. Of every frame's annotations: the whole
-/// file, or the pose where one file serves all frames. Points that change between the two kilobytes without changing the
-/// size go unseen; a data set that was generated, converted or copied anew with other settings does not. It takes some tens
-/// of microseconds per frame: reading whole clouds would take minutes before a training starts.
+/// Of every frame's points: the size of the file, its first and its last kilobyte. Of every frame's annotations: the
+/// whole file, or the pose if one file serves all frames. Points that change between the two kilobytes without changing
+/// the size are not detected; a data set that was generated, converted or copied again with other settings is. It takes
+/// some tens of microseconds per frame: reading whole clouds would take minutes before a training starts.
 #[must_use]
 pub fn content_sha256<'a>(scenarios: impl IntoIterator<Item = &'a Scenario>) -> String {
     let mut hash = Sha256::new();
@@ -52,7 +53,8 @@ fn list(scenario: &Scenario, hash: &mut Sha256) {
     scenario.ticks.iter().for_each(|tick| hash.update(format!("\n{} {}", tick.stem, tick.capture_nanos)));
 }
 
-/// A file that cannot be read, or is larger than any reader takes, counts as such: who needs its contents will hear of it.
+/// Hash of a frame. A file that cannot be read, or is too large for any reader, is hashed as such: its reader reports
+/// it.
 fn frame_digest(scenario: &Scenario, agent: &CavId, tick: &Tick) -> [u8; 32] {
     let mut hash = Sha256::new();
     let points = scenario.source.points_path(agent, tick, None);

@@ -1,19 +1,19 @@
 //! Localization sequences: NCLT as recorded and as LightLoc converts it, Oxford and QEOxford.
 //!
 //! `<root>/<sequence>/velodyne_left/<microseconds>.bin` (or NCLT's original `velodyne_sync`), with poses in
-//! `velodyne_left_False.h5` or, better aligned, QEOxford's `velodyne_left_calibrateFalse.h5`; where NCLT has neither,
-//! in the dataset's own `groundtruth_<day>.csv`, taken at the time of the sweep. A file `<scene>_pose_stats.txt` above
-//! the sequences holds the middle of the training sequences, from which LightLoc counts all positions; so does this
-//! reader where the file is there.
+//! `velodyne_left_False.h5` or, better aligned, QEOxford's `velodyne_left_calibrateFalse.h5`; if NCLT has neither, in
+//! the dataset's own `groundtruth_<day>.csv`, taken at the time of the sweep. A file `<scene>_pose_stats.txt` above the
+//! sequences holds the mean position of the training sequences, which LightLoc subtracts from all positions; so does
+//! this reader if the file exists.
 //!
 //! NCLT's sweeps are in the frame of the robot's body, on the ground below the LiDAR, and so is its ground truth: seen
-//! from (0.002, -0.004, -0.957) m, where the dataset says the LiDAR is, each laser of a sweep keeps its elevation to
-//! within 0.1 degrees; seen from the origin it does not.
+//! from (0.002, -0.004, -0.957) m, the position of the LiDAR in the dataset's documentation, each laser of a sweep
+//! keeps its elevation to within 0.1 degrees; seen from the origin it does not.
 //!
 //! Sensor and world of these recordings have x forward, y right, z **down**: right-handed. LightLoc negates z of the
 //! points alone, which is a mirror, and leaves the poses as they are. Here points and poses take the same half turn
 //! about x, `C = diag(1, -1, -1)`: a point becomes `C p`, a pose `C M C`. It is a rotation, so distances, chirality and
-//! the motion between scans stay what they were.
+//! the motion between scans are unchanged.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -32,10 +32,10 @@ use crate::pcd::PcdCloud;
 
 /// Converted points, one file per sweep.
 const CONVERTED: &str = "velodyne_left";
-/// NCLT's own.
+/// NCLT's original points.
 const RAW: &str = "velodyne_sync";
 
-/// How the points of a sequence are stored.
+/// Storage of the points of a sequence.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Storage {
     NcltRaw,
@@ -56,12 +56,12 @@ impl Storage {
 #[derive(Debug)]
 struct Sequence {
     points_dir: PathBuf,
-    /// By microseconds; empty where no file has any.
+    /// By microseconds; empty if no file has any.
     world_from_lidar: BTreeMap<u64, Pose>,
     sweeps: Sweeps,
 }
 
-/// Whether a folder is a sequence.
+/// True if a folder is a sequence.
 pub(super) fn is_sequence(dir: &Path) -> bool {
     [CONVERTED, RAW].iter().any(|name| files::holds(&dir.join(name), ".bin"))
 }
@@ -119,7 +119,8 @@ fn storage(dir: &Path) -> Storage {
     }
 }
 
-/// The poses of the best file there is, from the middle of the training sequences where that is known, turned to z up.
+/// The poses of the best available file, relative to the mean of the training sequences if that is known, turned to z
+/// up.
 fn poses(
     dir: &Path,
     storage: Storage,
@@ -135,10 +136,10 @@ fn poses(
     Ok(Some(poses))
 }
 
-/// What LightLoc calls the scene, and the poses by microseconds in the axes of their file.
+/// LightLoc's name of the scene, and the poses by microseconds in the axes of their file.
 type StoredPoses = (&'static str, BTreeMap<u64, Pose>);
 
-/// The poses of the best file there is, as they stand there.
+/// The poses of the best available file, as stored.
 fn poses_as_stored(
     dir: &Path,
     storage: Storage,
@@ -161,7 +162,8 @@ fn poses_as_stored(
     Ok(Some(("NCLT", stamps.keys().filter_map(at).collect())))
 }
 
-/// What LightLoc takes from all positions of a scene, metres in the axes of the poses' file; nothing without its file.
+/// Mean that LightLoc subtracts from all positions of a scene, metres in the axes of the poses' file; zero without its
+/// file.
 fn middle_m(dir: &Path, scene: &str) -> Result<Translation3<f64>, ReadError> {
     let name = format!("{scene}_pose_stats.txt");
     let Some(path) = files::above(dir).map(|above| above.join(&name)).find(|path| path.is_file()) else {
@@ -171,8 +173,8 @@ fn middle_m(dir: &Path, scene: &str) -> Result<Translation3<f64>, ReadError> {
     Ok(Translation3::new(x, y, z))
 }
 
-/// The mean of positions: LightLoc writes three numbers, one a line; SGLoc, LiSA, DiffLoc and others a row of three, and
-/// their standard deviation as a second row.
+/// The mean of positions: LightLoc writes three numbers, one a line; SGLoc, LiSA, DiffLoc and others a row of three,
+/// and their standard deviation as a second row.
 fn first_row(path: &Path) -> Result<[f64; 3], ReadError> {
     let mut lines = lines(path)?;
     lines.retain(|(_, text)| !text.trim_start().starts_with('#'));
@@ -295,7 +297,7 @@ mod tests {
             let row = &rows[5][4 * line..4 * line + 4];
             row[0] * f64::from(down[0]) + row[1] * f64::from(down[1]) + row[2] * f64::from(down[2]) + row[3]
         });
-        // Their world with its z turned up, and nothing mirrored.
+        // The reference's world with its z turned up, and nothing mirrored.
         assert!((ours - nalgebra::Point3::new(theirs[0], -theirs[1], -theirs[2])).norm() < 1e-6);
     }
 
@@ -333,15 +335,15 @@ mod tests {
         let [x, y, z] = pose.translation_m;
         assert!((x - 1.0).abs() < 1e-9 && (y + 0.5).abs() < 1e-9 && (z - 3.0).abs() < 1e-9, "{pose:?}");
         assert!((pose.yaw_rad() + turn).abs() < 1e-9, "east is to the right of north");
-        // LightLoc counts from the middle of the training sequences.
+        // LightLoc's positions are relative to the mean of the training sequences.
         write(dir.path(), "NCLT_pose_stats.txt", b"100.0\n-50.0000000\n-4.0\n");
         let moved = load().world_from_lidar.unwrap();
         let [x, y, z] = moved.translation_m;
         assert!((x + 99.0).abs() < 1e-9 && (y + 50.5).abs() < 1e-9 && (z + 1.0).abs() < 1e-9, "{x} {y} {z}");
-        // What lies above the folder does not depend on how that is called.
+        // The files above the folder do not depend on the path by which it is opened.
         let same = open(&dir.path().join("2012-01-15/velodyne_sync/.."));
         assert_eq!(same.scenarios[0].load(0, 0, &LoadOptions::default()).unwrap().world_from_lidar, Some(moved));
-        // Others write a row of three, and their deviation below it.
+        // Other tools write a row of three, and their deviation below it.
         for rows in ["100.0 -50.0 -4.0\n", "100.0 -50.0 -4.0\n3 4 5\n", "# mean, deviation\n100 -50 -4\n3 4 nan\n"] {
             write(dir.path(), "NCLT_pose_stats.txt", rows.as_bytes());
             assert_eq!(load().world_from_lidar, Some(moved), "{rows}");
@@ -361,7 +363,7 @@ mod tests {
     }
 
     #[test]
-    fn raw_nclt_has_no_poses_and_what_lacks_a_sweep_is_said() {
+    fn raw_nclt_has_no_poses_and_missing_sweeps_are_reported() {
         let dir = tempfile::tempdir().unwrap();
         write(dir.path(), "2012-01-15/velodyne_sync/1326652795280148.bin", &[0x20, 0x4e, 0x20, 0x4e, 0, 0, 51, 3]);
         let dataset = open(dir.path());

@@ -15,9 +15,9 @@ use support::csv_file;
 
 /// Largest file that is read, bytes: some two million rows.
 const MAX_BYTES: u64 = 256 << 20;
-/// Between rows farther apart than this nothing is known, microseconds.
+/// Largest gap between rows over which poses are interpolated, microseconds.
 const MAX_GAP_MICROS: u64 = 1_000_000;
-/// What the columns hold, for messages.
+/// Names of the columns, for messages.
 const COLUMNS: [&str; 7] = ["utime", "x", "y", "z", "roll", "pitch", "heading"];
 
 /// The poses of one day, in the axes of the file.
@@ -37,7 +37,8 @@ pub(super) fn find(dir: &Path, name: &str) -> Option<PathBuf> {
 }
 
 impl GroundTruth {
-    /// Reads a file. Rows that cannot be read, or whose time is not between their neighbours', are left out and named.
+    /// Reads a file. Rows that cannot be read, or whose time is not between their neighbours', are left out and
+    /// reported.
     pub(super) fn read(path: &Path, problems: &mut Vec<ReadError>) -> Result<Self, ReadError> {
         Ok(Self::parse(path, &files::read_text(path, MAX_BYTES)?, problems))
     }
@@ -64,7 +65,8 @@ impl GroundTruth {
         Self { poses }
     }
 
-    /// The pose at a time, evenly between the rows around it; `None` before the first, after the last and in gaps.
+    /// The pose at a time, interpolated between the rows around it; `None` before the first, after the last and in
+    /// gaps.
     pub(super) fn at(&self, micros: u64) -> Option<Isometry3<f64>> {
         let after = self.poses.partition_point(|(time, _)| *time < micros);
         let (next_time, next) = self.poses.get(after)?;
@@ -74,14 +76,14 @@ impl GroundTruth {
         let (last_time, last) = self.poses.get(after.checked_sub(1)?)?;
         let gap = next_time - last_time;
         let share = (micros - last_time) as f64 / gap as f64;
-        // Half a turn within a gap has no middle.
+        // Half a turn within a gap cannot be interpolated.
         (gap <= MAX_GAP_MICROS).then(|| last.try_lerp_slerp(next, share, 1e-9)).flatten()
     }
 }
 
 /// Indices of the longest selection of values that increase.
 fn longest_increasing(values: &[u64]) -> Vec<usize> {
-    // Of the selections of each length, the index of the smallest last value; and what comes before each value.
+    // Of the selections of each length, the index of the smallest last value; and the predecessor of each value.
     let mut ends: Vec<usize> = Vec::new();
     let mut before: Vec<Option<usize>> = Vec::with_capacity(values.len());
     for (index, value) in values.iter().enumerate() {
@@ -98,7 +100,7 @@ fn longest_increasing(values: &[u64]) -> Vec<usize> {
     selection
 }
 
-/// Time and pose of a row; `None` where it holds no pose.
+/// Time and pose of a row; `None` if it holds no pose.
 fn row(path: &Path, line: u64, record: &StringRecord) -> Result<Option<(u64, Isometry3<f64>)>, ReadError> {
     if record.len() != COLUMNS.len() {
         let reason = format!("{} columns, expected {}", record.len(), COLUMNS.len());
@@ -157,7 +159,7 @@ mod tests {
         assert_eq!(truth.at(T0).unwrap().translation.vector.as_slice(), [10.0, 20.0, -1.0]);
         let middle = truth.at(T0 + 25_000).unwrap();
         assert!((middle.translation.vector - nalgebra::Vector3::new(10.5, 20.0, -1.5)).norm() < 1e-9);
-        // The short way round, through pi.
+        // The shorter rotation, through pi.
         let (_, _, heading) = truth.at(T0 + 50_000).unwrap().rotation.euler_angles();
         assert!(heading.abs() > 3.13, "{heading}");
         assert_eq!(truth.at(T0 + 100_001), None);
@@ -173,7 +175,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_is_known_in_gaps() {
+    fn gaps_are_not_interpolated() {
         let truth = sound(&format!("{T0},0,0,0,0,0,0\n{},9,0,0,0,0,0\n", T0 + 1_000_001));
         assert_eq!(truth.at(T0 + 500_000), None);
         assert!(truth.at(T0 + 1_000_001).is_some());
@@ -191,7 +193,7 @@ mod tests {
         ] {
             let (truth, problems) = parse(&(row(T0, 1) + &bad + &row(T0 + 20, 3) + &row(T0 + 30, 4)));
             assert_eq!(problems, [format!("groundtruth_2012-01-15.csv{expected}")], "{bad}");
-            // The first of two rows of one time may be the one that is left out.
+            // Of two rows of one time the first may be left out.
             assert_eq!(truth.at(T0 + 20).unwrap().translation.vector.x, 3.0);
             assert_eq!(truth.poses.len(), 3);
         }

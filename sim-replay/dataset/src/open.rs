@@ -1,4 +1,4 @@
-//! Finding out what layout a folder has.
+//! Opening of data sets: detects the layout of a folder.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -17,18 +17,18 @@ use super::{
     localization, nuscenes, recorded, unfinished,
 };
 
-/// How far below the opened folder sequences of a single vehicle are looked for.
+/// Depth below the opened folder to which sequences of a single vehicle are searched.
 const SEQUENCE_DEPTH: usize = 2;
-/// How many frames of a scenario are tried to tell its layout.
+/// Number of frames of a scenario that are tried to detect its layout.
 const FRAMES_TO_TRY: usize = 5;
-/// Faults that are spelled out where nothing can be opened.
+/// Largest number of faults listed when nothing can be opened.
 const SHOWN_PROBLEMS: usize = 5;
 
-/// What a dataset does not say of itself.
+/// Properties that a data set does not record itself.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct OpenOptions {
-    /// Time from one stored frame to the next where neither time stamps nor the length of a simulator's tick are
-    /// recorded, nanoseconds. The datasets of the OPV2V family store ten frames a second.
+    /// Time from one stored frame to the next if neither time stamps nor the length of a simulator's tick are recorded,
+    /// nanoseconds. The data sets of the OPV2V family store ten frames a second.
     pub period_nanos: u64,
     /// Divisor of the intensities of LiDAR sweeps.
     pub intensity_scale: IntensityScale,
@@ -40,16 +40,16 @@ impl Default for OpenOptions {
     }
 }
 
-/// Opens the dataset, split, scenario or sequence in `dir`, or a recording; the layout is found out.
+/// Opens the data set, split, scenario or sequence in `dir`, or a recording; the layout is detected.
 ///
 /// # Errors
-/// [`ReadError`] when `dir` cannot be read or is no layout that is known here. What is wrong with single frames is
-/// found when they are loaded; what had to be left out stands in [`Dataset::problems`].
+/// [`ReadError`] if `dir` cannot be read or has no supported layout. Faults of single frames are found when they are
+/// loaded; parts that had to be left out are listed in [`Dataset::problems`].
 pub fn open(dir: &Path) -> Result<Dataset, ReadError> {
     open_with(dir, &OpenOptions::default())
 }
 
-/// [`open`] with what the dataset does not say of itself.
+/// [`open`] with the properties that the data set does not record itself.
 ///
 /// # Errors
 /// As [`open`].
@@ -73,7 +73,7 @@ fn open_any(dir: &Path, options: &OpenOptions) -> Result<Dataset, ReadError> {
     if !folders.is_empty() {
         return open_agent_folders(dir, &folders, options, problems);
     }
-    // The same folders are looked into again.
+    // The same folders are listed again.
     problems.clear();
     let mut scenarios = Vec::new();
     open_single_vehicles(dir, (dir, SEQUENCE_DEPTH), options, &mut scenarios, &mut problems)?;
@@ -83,7 +83,7 @@ fn open_any(dir: &Path, options: &OpenOptions) -> Result<Dataset, ReadError> {
     }
 }
 
-/// Opens what is a sequence or split of one of the layouts with a single vehicle, at `dir` or below.
+/// Opens the sequences and splits of one of the layouts with a single vehicle, at `dir` or below.
 fn open_single_vehicles(
     root: &Path,
     (dir, depth): (&Path, usize),
@@ -105,7 +105,7 @@ fn open_single_vehicles(
     } else {
         return Ok(());
     };
-    // One sequence that cannot be opened does not take the others with it.
+    // One sequence that cannot be opened does not prevent opening the others.
     match opened {
         Ok(scenario) => scenarios.push(scenario),
         Err(error) => problems.push(error),
@@ -171,8 +171,8 @@ fn agent_folder_scenario(
     }
 }
 
-/// The shape of the first pose that can be read decides, and then the kind of sweeps. Frames with another shape are named
-/// when they are loaded.
+/// The layout by the shape of the first pose that can be read, and then by the kind of sweeps. Frames with another
+/// shape are reported when they are loaded.
 fn family_layout(folder: &ScenarioFolder) -> Layout {
     let frames = folder.stems.iter().flat_map(|stem| folder.agents.iter().map(move |agent| folder.yaml(agent, stem)));
     match frames.take(FRAMES_TO_TRY).find_map(|path| lidar_pose(&path).ok()) {
@@ -187,7 +187,7 @@ fn lidar_pose(path: &Path) -> Result<WrittenPose, ReadError> {
     WrittenPose::read(&Field::root(path, &node).required("lidar_pose")?)
 }
 
-/// The one fault that there is, or all of them, or that the layout is not known.
+/// The only fault, or all of them, or an unknown layout.
 fn nothing_opened(dir: &Path, mut problems: Vec<ReadError>) -> ReadError {
     match problems.len() {
         0 => unknown(dir),
@@ -209,7 +209,7 @@ fn unknown(dir: &Path) -> ReadError {
         "this is the folder of one agent: open the scenario above it".to_owned()
     } else {
         let layouts = layouts_text();
-        format!("no known layout; at most three folders down, expected one of\n{}", layouts.trim_end())
+        format!("no supported layout; at most three folders down, expected one of\n{}", layouts.trim_end())
     };
     ReadError::Layout { path: dir.to_owned(), reason }
 }

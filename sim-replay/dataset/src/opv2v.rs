@@ -1,7 +1,7 @@
 //! Frames of OPV2V, V2XSet, V2X-R, V2VDet and generated scenes, and of V2X-Real and V2XPnP.
 //!
-//! OPV2V's files are left-handed: points, poses and boxes are mirrored here, all together. V2X-Real comes from real sensors
-//! in the same format: the formula of its matrices is the same, and nothing is mirrored.
+//! OPV2V's files are left-handed: points, poses and boxes are mirrored here, all together. V2X-Real comes from real
+//! sensors in the same format: the formula of its matrices is the same, and nothing is mirrored.
 
 use std::path::PathBuf;
 

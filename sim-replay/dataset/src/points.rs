@@ -1,7 +1,7 @@
-//! Sweeps of all layouts: the one door to point files, with intensities from 0 to 1.
+//! Sweeps of all layouts: the single reader of point files, with intensities from 0 to 1.
 //!
-//! Numbers that do not tell their own form (how many floats a point has, how far intensities reach) are decided by the
-//! first sweeps of each agent, once, so that every frame is read alike.
+//! Properties that files do not record (number of floats per point, range of intensities) are determined from the first
+//! sweeps of each agent, once, so that every frame is read alike.
 
 mod floats;
 mod intensity;
@@ -23,10 +23,10 @@ use crate::pcd::{self, IntensityKind, IntensityOrigin, PcdCloud};
 
 /// Largest point file that is read, bytes: a sweep of a 128-channel LiDAR has some 10 MB.
 const MAX_BYTES: u64 = 1 << 30;
-/// Sweeps of an agent that decide what its files do not tell.
+/// Number of sweeps of an agent from which the missing properties are determined.
 const SAMPLES: usize = 3;
 
-/// How the points of a file are stored.
+/// Storage of the points of a file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(super) enum SweepStorage {
     /// By its name: `.pcd` is PCD, all else (`.bin`, `.pcd.bin`) little-endian `f32`, 4 or 5 per point.
@@ -48,34 +48,34 @@ pub(super) struct Sweeps {
     agents: BTreeMap<CavId, AgentSweeps>,
 }
 
-/// What the first sweeps of an agent tell about the others.
+/// Properties determined from the first sweeps of an agent.
 #[derive(Debug, Default)]
 struct AgentSweeps {
     files: Vec<PathBuf>,
     form: OnceLock<Result<FloatForm, String>>,
     divisor: OnceLock<f32>,
-    /// Whether it is told that there are no intensities.
+    /// Set once the missing intensities have been reported.
     is_told: OnceLock<()>,
 }
 
 impl Sweeps {
-    /// Files of an agent that are looked at to find samples.
+    /// Largest number of files of an agent that are tried to find samples.
     pub(super) const MOST_TRIED: usize = 30;
 
-    /// Sweeps of files that are stored so.
+    /// Sweeps of files with this storage.
     pub(super) fn new(storage: SweepStorage, options: &OpenOptions) -> Self {
         Self { storage, scale: options.intensity_scale, agents: BTreeMap::new() }
     }
 
-    /// Adds an agent with the files of its plain sweeps, in order. The first that can be read and hold points decide what
-    /// files do not tell of themselves; nothing is read before the first [`Self::read`].
+    /// Adds an agent with the files of its plain sweeps, in order. The first that can be read and hold points determine
+    /// the properties that files do not record; nothing is read before the first [`Self::read`].
     pub(super) fn with_agent(mut self, agent: CavId, files: impl IntoIterator<Item = PathBuf>) -> Self {
         let files = files.into_iter().take(Self::MOST_TRIED).collect();
         self.agents.insert(agent, AgentSweeps { files, ..AgentSweeps::default() });
         self
     }
 
-    /// Sweeps of a layout that knows one vehicle.
+    /// Sweeps of a layout with one vehicle.
     pub(super) fn of_single_vehicle(
         storage: SweepStorage,
         files: impl IntoIterator<Item = PathBuf>,
@@ -95,7 +95,7 @@ impl Sweeps {
         let mut cloud = agent.read_stored(self.storage, path)?;
         if cloud.intensity.is_none() {
             agent.is_told.get_or_init(|| {
-                tracing::warn!("{}: no field of intensity, as in others maybe: it is 0", path.display())
+                tracing::warn!("{}: no intensity field (possibly in other files too): intensity is 0", path.display())
             });
         }
         self.scale.apply(&mut cloud, || agent.divisor(self.storage));
@@ -104,7 +104,7 @@ impl Sweeps {
 }
 
 impl AgentSweeps {
-    /// Divisor of intensities whose type does not tell their scale.
+    /// Divisor of intensities whose type does not determine their scale.
     fn divisor(&self, storage: SweepStorage) -> f32 {
         *self.divisor.get_or_init(|| {
             let clouds = self.files.iter().filter_map(|path| self.read_stored(storage, path).ok());
@@ -122,7 +122,7 @@ impl AgentSweeps {
         })
     }
 
-    /// How many floats a point has.
+    /// Number of floats per point.
     fn form(&self, path: &Path) -> Result<FloatForm, ReadError> {
         let form = self.form.get_or_init(|| {
             let files = self.files.iter().filter(|path| !is_pcd(path));
@@ -132,7 +132,7 @@ impl AgentSweeps {
         form.clone().map_err(|reason| ReadError::malformed(path, reason))
     }
 
-    /// Reads a sweep with the intensities that are stored.
+    /// Reads a sweep with the intensities as stored.
     fn read_stored(&self, storage: SweepStorage, path: &Path) -> Result<PcdCloud, ReadError> {
         match storage {
             SweepStorage::ByName if is_pcd(path) => read_pcd_stored(path),
@@ -154,7 +154,7 @@ fn is_pcd(path: &Path) -> bool {
     path.extension().is_some_and(|kind| kind.eq_ignore_ascii_case("pcd"))
 }
 
-/// Reads a PCD file that is no sweep of a LiDAR: the fourth value is as stored, or the red byte of a colour from 0 to 1.
+/// Reads a PCD file that is no LiDAR sweep: the fourth value is as stored, or the red byte of a colour from 0 to 1.
 pub(super) fn read_pcd(path: &Path) -> Result<PcdCloud, ReadError> {
     read_with(path, pcd::decode)
 }
@@ -205,7 +205,7 @@ fn read_nclt_raw(path: &Path) -> Result<PcdCloud, ReadError> {
     })
 }
 
-/// Turns y round: left-handed points become right-handed ones.
+/// Negates y: left-handed points become right-handed ones.
 pub(super) fn mirror_y(cloud: &mut PointCloud) {
     for [_, y, ..] in &mut cloud.xyzi {
         *y = -*y;

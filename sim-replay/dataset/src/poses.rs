@@ -1,19 +1,18 @@
-//! Whether a scenario has the poses that some uses of it need.
+//! Check that a scenario has poses, for operations that need them.
 
 use super::{LoadOptions, Scenario};
 
-/// Frames that are looked at: the first of them may be damaged.
+/// Frames that are tried, since the first of them may be damaged.
 const FRAMES_TO_TRY: usize = 10;
 
 impl Scenario {
-    /// Whether the recording says where an agent's LiDAR is, judged by the first of its frames from `tick` on that can be
-    /// read.
+    /// True if the recording gives the pose of an agent's LiDAR, according to the first readable frame from `tick` on.
     #[must_use]
     pub fn has_poses(&self, agent: usize, tick: usize) -> bool {
         let blind = LoadOptions { points: false, ..LoadOptions::default() };
         let ticks = (tick..self.ticks.len()).take(FRAMES_TO_TRY);
         let mut frames = ticks.filter_map(|tick| self.load(agent, tick, &blind).ok());
-        // Where nothing can be read, that is what is wrong.
+        // If nothing can be read, that is reported instead.
         frames.next().is_none_or(|frame| frame.world_from_lidar.is_some())
     }
 }

@@ -1,4 +1,4 @@
-//! LivelinessToken of agents: an agent takes part at the ego's ticks at which it has a frame.
+//! Presence of agents: an agent takes part at the ego's ticks at which it has a frame.
 
 use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
@@ -8,17 +8,17 @@ use protocol::CavId;
 use super::{LoadOptions, MissingFrame, Problem, Scenario, Tick};
 use crate::frame::Frame;
 
-/// Who is absent when, and the moments of all agents.
+/// Absent agents by tick, and the capture times of all agents.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Absences {
     /// Pairs of agent and tick, by their indices, that have no frame.
     pairs: Arc<HashSet<(usize, usize)>>,
-    /// Moments at which any agent has a frame, in order; none where they are the ticks.
+    /// Capture times at which any agent has a frame, in order; none if they are the ticks.
     moments: Option<Arc<Vec<Tick>>>,
 }
 
 impl Absences {
-    /// The missing frames of `agents` at `ticks`; others do not concern them.
+    /// The missing frames of `agents` at `ticks`; other missing frames are ignored.
     pub(super) fn new(agents: &[CavId], ticks: &[Tick], missing: &[MissingFrame]) -> Self {
         let agents: HashMap<&CavId, usize> = agents.iter().enumerate().map(|(index, agent)| (agent, index)).collect();
         let ticks: HashMap<&str, usize> =
@@ -27,7 +27,7 @@ impl Absences {
         Self { pairs: Arc::new(missing.iter().filter_map(place).collect()), moments: None }
     }
 
-    /// The same where agents have frames at further moments; `moments` are all of them.
+    /// The same with further capture times of other agents; `moments` are all of them.
     pub(super) fn among(self, moments: Vec<Tick>) -> Self {
         Self { moments: Some(Arc::new(moments)), ..self }
     }
@@ -36,17 +36,17 @@ impl Absences {
 /// The frames of one tick that could be read.
 #[derive(Debug, Default)]
 pub struct LoadedTick {
-    /// Frames with the index of their agent, in the order asked for. Absent agents and unreadable frames are not among
-    /// them.
+    /// Frames with the index of their agent, in the requested order. Absent agents and unreadable frames are not
+    /// included.
     pub frames: Vec<(usize, Frame)>,
     /// Frames that could not be read: index of the agent, and the reason.
     pub unreadable: Vec<(usize, Problem)>,
-    /// How many agents are absent.
+    /// Number of absent agents.
     pub absent: usize,
 }
 
 impl Scenario {
-    /// Whether an agent has a frame at a tick, by their indices in [`Self::agents`] and [`Self::ticks`].
+    /// True if an agent has a frame at a tick, by their indices in [`Self::agents`] and [`Self::ticks`].
     #[must_use]
     pub fn is_present(&self, agent_index: usize, tick_index: usize) -> bool {
         !self.absences.pairs.contains(&(agent_index, tick_index))
@@ -57,8 +57,8 @@ impl Scenario {
         (0..self.agents.len()).filter(move |&agent| self.is_present(agent, tick_index))
     }
 
-    /// The scenario with some of its agents (indices), the first as the ego: its ticks are those at which that one has a
-    /// frame.
+    /// The scenario with some of its agents (indices), the first as the ego: its ticks are those at which that one has
+    /// a frame.
     #[must_use]
     pub fn arranged(&self, order: &[usize]) -> Self {
         let agents: Vec<CavId> = order.iter().filter_map(|&index| self.agents.get(index).cloned()).collect();
@@ -76,13 +76,13 @@ impl Scenario {
         Self { agents, ticks, missing, absences, roadside_units, ..self.clone() }
     }
 
-    /// How many frames of agents other than the ego are missing at its ticks.
+    /// Number of missing frames of agents other than the ego at its ticks.
     #[must_use]
     pub fn absent_frames(&self) -> usize {
         self.absences.pairs.iter().filter(|(_, tick)| *tick < self.ticks.len()).count()
     }
 
-    /// Reads the frames of `agents` (indices) at a tick: whoever is present and readable.
+    /// Reads the frames of `agents` (indices) at a tick, of those present and readable.
     pub fn load_tick(
         &self,
         tick_index: usize,

@@ -6,16 +6,16 @@ use serde::{Deserialize, Serialize};
 
 use super::ReadError;
 
-/// Something wrong with a data set that did not stop the reading: the part is left out, the rest is used.
+/// A fault of a data set that did not stop the reading: the part is left out, the rest is used.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub struct Problem {
     /// The file or folder.
     pub path: String,
-    /// The line, from 1, where the file has lines.
+    /// The line, from 1, if the file has lines.
     pub line: Option<u64>,
     /// The field.
     pub field: Option<String>,
-    /// The finding, with place and both values.
+    /// The finding, with position and both values.
     pub message: String,
 }
 

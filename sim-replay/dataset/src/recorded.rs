@@ -1,4 +1,4 @@
-//! Recordings of live runs ([`recording`]) as scenes: what sensors measured, and the truth, come out as they went in.
+//! Recordings of live runs ([`recording`]) as scenes: sensor data and ground truth as they were published.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -21,7 +21,7 @@ pub(super) fn file_of(path: &Path) -> Option<PathBuf> {
     [path.to_path_buf(), path.join(IN_RUN_FOLDER)].into_iter().find(|file| is_recording(file))
 }
 
-/// Opens a recording as a dataset of one scenario. What was cut off its end stands in [`Dataset::problems`].
+/// Opens a recording as a data set of one scenario. A truncated end is reported in [`Dataset::problems`].
 pub(super) fn open(file: &Path) -> Result<Dataset, ReadError> {
     let recording = Recording::open(file).map_err(as_read_error)?;
     let mut problems = Vec::new();
@@ -58,11 +58,11 @@ struct Recorded {
 }
 
 impl Recorded {
-    /// A truth that cannot be read is a problem of its moment, and not of the scene. Of two replays of one moment the
-    /// first is taken, sweeps and truth alike.
+    /// An unreadable ground truth is a problem of its tick, and not of the scene. Of two replays of one tick the first
+    /// is used, sweeps and ground truth alike.
     fn new(recording: Recording, problems: &mut Vec<ReadError>) -> Result<Self, ReadError> {
         let mut sensors = BTreeMap::new();
-        let (mut truth, mut first_epochs, mut told_twice) = (BTreeMap::new(), BTreeMap::new(), 0);
+        let (mut truth, mut first_epochs, mut duplicates) = (BTreeMap::new(), BTreeMap::new(), 0);
         for entry in recording.entries() {
             let Stamp { capture_nanos, epoch, .. } = entry.header.stamp;
             match &entry.key.topic {
@@ -70,11 +70,11 @@ impl Recorded {
                     sensors.entry((capture_nanos, cav.clone(), *stream)).or_insert_with(|| entry.clone());
                 }
                 Topic::Truth => match first_epochs.get(&capture_nanos) {
-                    Some(first) => told_twice += u64::from(*first != epoch),
+                    Some(first) => duplicates += u64::from(*first != epoch),
                     None => {
                         first_epochs.insert(capture_nanos, epoch);
                         match message::<Truth>(&recording, entry) {
-                            Ok(told) => drop(truth.insert(capture_nanos, told)),
+                            Ok(message) => drop(truth.insert(capture_nanos, message)),
                             Err(problem) => problems.push(problem),
                         }
                     }
@@ -82,8 +82,9 @@ impl Recorded {
                 _ => {}
             }
         }
-        if told_twice > 0 {
-            let reason = format!("more than one replay tells the truth of {told_twice} moments: the first is taken");
+        if duplicates > 0 {
+            let reason =
+                format!("more than one replay published the ground truth of {duplicates} ticks: the first is used");
             problems.push(ReadError::malformed(recording.path(), reason));
         }
         let mut recorded = Self { recording, agents: Vec::new(), sensors, truth };
@@ -95,14 +96,14 @@ impl Recorded {
         Ok(recorded)
     }
 
-    /// Everyone with sweeps, in the order of the scene, which the truth keeps: the ego comes first.
+    /// All agents with sweeps, in the order of the scene, which is that of the ground truth: the ego comes first.
     fn in_order(&self) -> Vec<CavId> {
         let has_sweeps =
             |cav: &CavId| self.sensors.keys().any(|(_, known, stream)| known == cav && *stream == Stream::Lidar);
-        let told = self.truth.values().flat_map(|truth| truth.agents.iter().map(|agent| &agent.cav));
-        let untold = self.sensors.keys().map(|(_, cav, _)| cav);
+        let listed = self.truth.values().flat_map(|truth| truth.agents.iter().map(|agent| &agent.cav));
+        let unlisted = self.sensors.keys().map(|(_, cav, _)| cav);
         let mut agents: Vec<CavId> = Vec::new();
-        for cav in told.chain(untold) {
+        for cav in listed.chain(unlisted) {
             if !agents.contains(cav) && has_sweeps(cav) {
                 agents.push(cav.clone());
             }
@@ -110,7 +111,7 @@ impl Recorded {
         agents
     }
 
-    /// The moments of which the ego's sweep was recorded, and the sweeps that are missing at any moment.
+    /// The ticks at which the ego's sweep was recorded, and the missing sweeps at any capture time.
     fn ticks(&self) -> (Vec<Tick>, Vec<MissingFrame>) {
         let mut captures: Vec<u64> =
             self.sensors.keys().filter(|(_, _, stream)| *stream == Stream::Lidar).map(|(at, _, _)| *at).collect();

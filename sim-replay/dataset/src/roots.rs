@@ -1,14 +1,15 @@
-//! Roots of data sets that have index files: looked for in the opened folder and a little below.
+//! Roots of data sets that have index files: searched in the opened folder and a little below.
 
 use std::fs;
 use std::path::{Path, PathBuf};
 
-/// How far below the opened folder roots are looked for.
+/// Depth below the opened folder to which roots are searched.
 const MAX_DEPTH: usize = 2;
 
-/// The folders at or below `dir` that `is_root` accepts, in text order of their paths. Nothing is looked for below a root.
+/// The folders at or below `dir` that `is_root` accepts, in text order of their paths. The search does not go below a
+/// root.
 ///
-/// Folders that cannot be listed are passed over: whoever lists them for their data names them.
+/// Folders that cannot be listed are skipped: the reader of their data reports them.
 pub(super) fn find(dir: &Path, is_root: impl Fn(&Path) -> bool) -> Vec<PathBuf> {
     let mut level = vec![dir.to_owned()];
     let mut found = Vec::new();
@@ -21,7 +22,8 @@ pub(super) fn find(dir: &Path, is_root: impl Fn(&Path) -> bool) -> Vec<PathBuf> 
     found
 }
 
-/// Folders that are not hidden, behind symbolic links as well. Files cost no system call each, however many there are.
+/// Folders that are not hidden, including targets of symbolic links. Files cost no system call each, however many there
+/// are.
 fn folders(dir: &Path) -> Vec<PathBuf> {
     let entries = fs::read_dir(dir).into_iter().flatten().flatten();
     let is_folder = |entry: &fs::DirEntry| match entry.file_type() {

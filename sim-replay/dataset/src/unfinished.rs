@@ -1,13 +1,13 @@
-//! Marks of folders whose writing was interrupted.
+//! Marker files of folders whose writing was interrupted.
 
 use std::path::{Path, PathBuf};
 
 use super::{Dataset, ReadError};
 
-/// The file that marks a folder while a data set is written into it. Opening such a folder reports a problem.
+/// Name of the file that marks a folder while a data set is written into it. Opening such a folder reports a problem.
 pub const UNFINISHED: &str = ".unfinished";
 
-/// Adds a problem for each mark in the folder that was opened and in those of its scenarios.
+/// Adds a problem for each marker in the opened folder and in those of its scenarios.
 pub(super) fn report(dir: &Path, dataset: &mut Dataset) {
     let scenarios = dataset.scenarios.iter().map(|scenario| dir.join(&scenario.name).join(UNFINISHED));
     let marks: Vec<PathBuf> =

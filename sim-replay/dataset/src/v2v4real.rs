@@ -1,7 +1,7 @@
 //! Frames of V2V4Real.
 //!
-//! The folders are OPV2V's. Different are: right-handed axes, pose matrices (pickled NumPy arrays or lists), objects in the
-//! frame of the agent's own LiDAR, and ids that associate objects across agents.
+//! The folders are OPV2V's. Differences: right-handed axes, pose matrices (pickled NumPy arrays or lists), objects in
+//! the frame of the agent's own LiDAR, and ids that associate objects across agents.
 
 use std::path::PathBuf;
 
@@ -16,7 +16,7 @@ use super::{FrameSource, ReadError, Tick};
 use crate::frame::Frame;
 use crate::pcd::PcdCloud;
 
-/// Objects without partner get this times the agent's id added, so that ids of two agents do not meet.
+/// Objects without partner get this times the agent's id added, so that ids of two agents do not collide.
 const UNMATCHED_STEP: i64 = 100;
 
 /// A scenario of V2V4Real.
@@ -69,12 +69,12 @@ impl V2v4Real {
         })
     }
 
-    /// `ass_id` is the id that both agents share; -1 says that only this agent has the object.
+    /// `ass_id` is the id that both agents share; -1 means that only this agent has the object.
     fn associated_id(&self, agent: &CavId, listed_id: i64, field: &Field<'_>) -> Result<i64, ReadError> {
         match field.optional("ass_id")?.map(|id| id.integer()).transpose()? {
             None => Ok(listed_id),
             Some(-1) => {
-                // Agents with names count by their place.
+                // Agents with names count by their index.
                 let place = || self.folder.agents.iter().position(|id| id == agent).unwrap_or(0) as i64;
                 let agent = agent.as_str().parse::<i64>().unwrap_or_else(|_| place());
                 Ok(listed_id.saturating_add(UNMATCHED_STEP.saturating_mul(agent)))
@@ -93,7 +93,7 @@ fn lidar_pose(field: &Field<'_>) -> Result<Pose, ReadError> {
     }
 }
 
-/// A matrix, or six numbers by the reference's formula in the right-handed axes of this dataset: nothing is mirrored.
+/// A matrix, or six numbers by the reference's formula in the right-handed axes of this data set: nothing is mirrored.
 fn pose(field: &Field<'_>) -> Result<Pose, ReadError> {
     match WrittenPose::read(field)? {
         WrittenPose::Matrix(matrix) => rigid(&matrix, field),
@@ -171,7 +171,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_pose_is_named() {
+    fn an_invalid_pose_is_reported() {
         let dir = tempfile::tempdir().unwrap();
         let sound = pickled_matrix(&EGO);
         write(dir.path(), "0", &sound, "");
@@ -180,7 +180,7 @@ mod tests {
         for (pose, expected) in [
             (pickled_matrix(&scaled), "000000.yaml:2: lidar_pose: pose matrix is not a rotation"),
             ("lidar_pose: [[1, 0], [0, 1]]\n".into(), "lidar_pose: a list of 2, expected 6 numbers or a 4x4 matrix"),
-            (pickled_matrix(&EGO).replace("_reconstruct", "evil"), "is none of those that are known"),
+            (pickled_matrix(&EGO).replace("_reconstruct", "evil"), "is not supported"),
             ("lidar_pose: [1, 2, 3, 4, 5, 6]\n".into(), "lidar_pose: 6 numbers as in OPV2V, but the scenario's first"),
         ] {
             write(dir.path(), "1", &pose, &object(1, 10.0, 4.0, ""));
@@ -190,7 +190,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wrong_with_an_object_or_another_pose_costs_no_frame() {
+    fn faults_of_an_object_or_another_pose_cost_no_frame() {
         let dir = tempfile::tempdir().unwrap();
         let objects = object(1, 10.0, 4.0, "    ass_id: one\n") + &object(2, 1e9, 0.0, "") + &object(3, 5.0, 0.0, "");
         write(dir.path(), "0", &(pickled_matrix(&EGO) + "predicted_ego_pos: [1, 2]\n"), &objects);

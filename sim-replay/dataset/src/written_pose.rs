@@ -1,5 +1,5 @@
-//! Poses as the OPV2V family writes them: six numbers, or a 4x4 matrix. The shape tells OPV2V and V2V4Real apart, in whatever
-//! form the numbers are stored.
+//! Poses of the OPV2V family: six numbers, or a 4x4 matrix. The shape distinguishes OPV2V from V2V4Real, in any storage
+//! of the numbers.
 
 use nalgebra::{Matrix4, RowVector4};
 use protocol::Pose;
@@ -41,7 +41,7 @@ impl WrittenPose {
 pub(super) fn rigid(matrix: &Matrix4<f64>, field: &Field<'_>) -> Result<Pose, ReadError> {
     let mut matrix = *matrix;
     let last = RowVector4::new(0.0, 0.0, 0.0, 1.0);
-    // Inverting and multiplying matrices leaves rounding in the last row.
+    // Inverting and multiplying matrices leaves rounding errors in the last row.
     if (matrix.row(3) - last).amax() < 1e-8 {
         matrix.set_row(3, &last);
     }

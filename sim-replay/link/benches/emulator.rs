@@ -1,14 +1,15 @@
-//! What a message costs beside the network it goes over: `air/<route>/<what>/<pace>/<KiB>`.
+//! Cost of a message compared with the raw network: `link/<route>/<what>/<pace>/<KiB>`.
 //!
-//! - `fleet`: from one client over the router to another, the way between an agent and an ego;
-//! - `direct`: from a client into the router's own process, where only the scorer sits.
+//! - `fleet`: from one client over the router to another, the route between an agent and an ego;
+//! - `direct`: from a client into the router's own process, the route to the scorer.
 //!
-//! - `raw`: zenoh on loopback from put to callback, with a payload of a map's bytes;
-//! - `raw-copied`: the same until the bytes lie together, the least that anyone needs who wants to use them;
-//! - `message`: from before encoding a dense `f32` map to after decoding it, checksums and value checks included.
+//! - `raw`: zenoh on loopback from put to callback, with a payload of the size of a feature map;
+//! - `raw-copied`: the same until the bytes are contiguous, the minimum for any use of them;
+//! - `message`: from before encoding a dense `f32` feature map to after decoding it, checksums and value checks
+//!   included.
 //!
-//! `cargo bench -p sim-replay --bench air`. The two take turns, so that whatever else the machine does hits both: each at
-//! 10 Hz, as a sensor does, and then back to back. On a busy machine the least times say more than the medians.
+//! `cargo bench -p link --bench emulator`. The two alternate, so that other load on the machine affects both: each at
+//! 10 Hz, as a sensor does, and then back to back. On a busy machine the minima are more reliable than the medians.
 
 use std::net::TcpListener;
 use std::sync::mpsc::{Receiver, channel};
@@ -38,8 +39,8 @@ fn features(kib: usize) -> BevFeatures {
     BevFeatures { grid, channels: CHANNELS as u32, code_of: None, values }
 }
 
-/// Puts a payload of `values`' bytes; how long until the subscriber's callback has it, and until its bytes lie together,
-/// as anyone needs them who wants to use them.
+/// Puts a payload of `values`' bytes; returns the time until the subscriber's callback has it, and until its bytes are
+/// contiguous, as any use of them requires.
 fn raw(publisher: &Publisher, arrivals: &Receiver<ZBytes>, values: Vec<f32>) -> Result<[Duration; 2], Failure> {
     let bytes = values.len() * 4;
     let payload = bytes::Bytes::from_owner(protocol::Body::Floats(values));
@@ -53,7 +54,7 @@ fn raw(publisher: &Publisher, arrivals: &Receiver<ZBytes>, values: Vec<f32>) -> 
     Ok([in_callback, time])
 }
 
-/// Encodes, sends, receives and decodes a map.
+/// Encodes, sends, receives and decodes a feature map.
 fn message(publisher: &Publisher, arrivals: &Receiver<ZBytes>, features: BevFeatures) -> Result<Duration, Failure> {
     let stamp = Stamp { cav: CavId::new("4279")?, epoch: 1, sequence: 1, capture_nanos: 0, publish_nanos: 0 };
     let expected = features.values[features.values.len() - 1];
@@ -72,7 +73,7 @@ fn message(publisher: &Publisher, arrivals: &Receiver<ZBytes>, features: BevFeat
     Ok(time)
 }
 
-/// Median and least, milliseconds.
+/// Median and minimum, milliseconds.
 fn summary(mut times: Vec<Duration>) -> [f64; 2] {
     times.sort_unstable();
     [times[times.len() / 2], times[0]].map(|time| time.as_secs_f64() * 1e3)
@@ -81,7 +82,7 @@ fn summary(mut times: Vec<Duration>) -> [f64; 2] {
 fn report(case: &str, times: Vec<Duration>, [raw_p50, raw_min]: [f64; 2]) {
     let [p50, min] = summary(times);
     let (ratio, min_ratio) = (p50 / raw_p50, min / raw_min);
-    println!("air/{case}: p50 {p50:.3} ms ({ratio:.2} x raw), min {min:.3} ms ({min_ratio:.2} x raw)");
+    println!("link/{case}: p50 {p50:.3} ms ({ratio:.2} x raw), min {min:.3} ms ({min_ratio:.2} x raw)");
 }
 
 fn main() -> Result<(), Failure> {
@@ -100,7 +101,7 @@ fn main() -> Result<(), Failure> {
 fn measure(route: &str, sender: &Session, receiver: &Session) -> Result<(), Failure> {
     let (arrive, arrivals) = channel();
     let subscriber = receiver.declare_subscriber("v2v/bench/4279/bev").callback(move |sample| {
-        // The receiver has gone only when the benchmark is over.
+        // The receiver is dropped only when the benchmark ends.
         let _ = arrive.send(sample.payload().clone());
     });
     let subscriber = subscriber.wait().map_err(|cause| cause.to_string())?;

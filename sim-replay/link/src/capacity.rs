@@ -1,4 +1,4 @@
-//! How much could have crossed by when, in whole numbers, so that no rounding adds up.
+//! Cumulative service curve of a link in integer bit-nanoseconds; rounding does not accumulate.
 
 use super::config::CapacityConfig;
 use super::trace::{OPPORTUNITY_BYTES, Step, Trace};
@@ -7,28 +7,28 @@ use super::trace_config::TraceConfig;
 /// Work of one byte: 8 bits, times the nanoseconds of a second, so that bits per second times nanoseconds are work.
 const WORK_PER_BYTE: u128 = 8_000_000_000;
 
-/// What a link could do.
+/// Cumulative service curve of a link.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Capacity {
-    /// Everything at once.
+    /// Unlimited rate.
     Unlimited,
-    /// A rate that stays, bit/s.
+    /// Constant rate, bit/s.
     Constant(u64),
     /// A rate that changes, with the work that is done before each step.
     Steps(Vec<(Step, u128)>),
-    /// Moments, nanoseconds, repeated from the last one on.
+    /// Delivery opportunities, nanoseconds, repeated after the last one.
     Opportunities(Vec<u64>),
-    /// Another, from a later moment on.
+    /// Another curve, from an offset on.
     Later {
         all: Box<Self>,
-        /// The moment, nanoseconds.
+        /// Offset into that curve, nanoseconds.
         offset_nanos: u64,
-        /// The work that could be done before it.
+        /// Work that could be done before it.
         before: u128,
     },
 }
 
-/// Work of so many bytes.
+/// Work of a number of bytes.
 pub(super) fn work(bytes: u64) -> u128 {
     u128::from(bytes) * WORK_PER_BYTE
 }
@@ -79,7 +79,7 @@ impl Capacity {
         }
     }
 
-    /// When `work` will have been done; never where the rate stays 0.
+    /// Time at which `work` will have been done; `None` if the rate stays 0.
     pub(super) fn time_of(&self, wanted: u128) -> Option<u64> {
         match self {
             Self::Unlimited => Some(0),
@@ -127,7 +127,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn work_is_done_exactly_when_it_is_said_to_be(
+        fn work_is_done_exactly_at_its_computed_time(
             rates in prop::collection::vec(0_u64..50_000_000, 1..6), bytes in 1_u64..10_000_000, constant in 1_u64..1_000_000_000,
             mut times in prop::collection::vec(0_u64..5_000, 1..30),
         ) {

@@ -1,10 +1,10 @@
-//! Chance that only depends on what it decides about, never on what was decided before.
+//! Randomness per message: depends on the message and the purpose only, not on earlier decisions.
 
 use protocol::CavId;
 
 use support::random::{SplitMix64, derive_seed};
 
-/// What is decided.
+/// Purpose of a random decision.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum Purpose {
     Delay = 1,
@@ -13,7 +13,7 @@ pub(super) enum Purpose {
     Duplicate = 4,
 }
 
-/// The chances of one direction of one link.
+/// Random numbers of one direction of one link.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Chance {
     seed: u64,
@@ -25,7 +25,7 @@ impl Chance {
         Self { seed: derive_seed(seed, &[letters(from), letters(to)]) }
     }
 
-    /// The numbers that decide one thing about one message.
+    /// Random numbers for one decision about one message.
     pub(super) fn of(self, purpose: Purpose, stream: u64, sequence: u64) -> SplitMix64 {
         SplitMix64::derived(self.seed, &[purpose as u64, stream, sequence])
     }

@@ -1,4 +1,4 @@
-//! The numbers that define a link.
+//! Configuration of a link.
 
 use std::path::{Path, PathBuf};
 
@@ -12,7 +12,7 @@ use super::trace_config::TraceConfig;
 /// Payload of one fragment where loss is drawn per fragment, bytes: what fits an 802.11p frame with its headers.
 pub(super) const FRAGMENT_BYTES: u64 = 1400;
 
-/// Why no link can be made.
+/// Reasons why a link is invalid.
 #[derive(Debug, thiserror::Error)]
 pub enum LinkError {
     /// A number is out of bounds.
@@ -20,20 +20,20 @@ pub enum LinkError {
     Value {
         /// Name of the field.
         field: &'static str,
-        /// What stood there.
+        /// Found value.
         value: f64,
-        /// What would be right.
+        /// Valid values.
         must: &'static str,
     },
     /// No preset has this name.
-    #[error("link: no preset is called {name:?}; there are {known}")]
+    #[error("link: unknown preset {name:?}; there are {known}")]
     Preset {
-        /// What was asked for.
+        /// Requested name.
         name: String,
-        /// What there is.
+        /// Available names.
         known: String,
     },
-    /// The delay or the loss is to come from a trace, but the capacity is not one of those.
+    /// The delay or the loss refers to a trace, but the capacity is none.
     #[error("link: {field} is trace, but capacity names no trace with such a column")]
     NoTrace {
         /// Name of the field.
@@ -42,36 +42,36 @@ pub enum LinkError {
     /// The trace is not readable.
     #[error(transparent)]
     Trace(#[from] TraceError),
-    /// What was named is no preset, and no file that can be read.
+    /// The name is neither a preset nor a readable file.
     #[error("{}: neither a preset of a link ({known}) nor a file that can be read: {source}", path.display())]
     File {
-        /// What was named.
+        /// Given name or path.
         path: PathBuf,
         /// The presets.
         known: String,
-        /// What the system said.
+        /// Error of the operating system.
         source: std::io::Error,
     },
-    /// The file says no link.
+    /// The file holds no valid link configuration.
     #[error("{}: {source}", path.display())]
     Yaml {
         /// The file.
         path: PathBuf,
-        /// What is wrong, with its place.
+        /// The fault, with its position.
         source: Box<serde_saphyr::Error>,
     },
-    /// The link of a file is wrong.
+    /// The link in a file is invalid.
     #[error("{}: {source}", path.display())]
     InFile {
         /// The file.
         path: PathBuf,
-        /// What is wrong.
+        /// The fault.
         source: Box<LinkError>,
     },
 }
 
 impl LinkError {
-    /// The same with the file that the link stands in, where it does not say that yet.
+    /// The same with the path of the link's file, if it has none yet.
     pub(super) fn in_file(name: &str, source: Self) -> Self {
         match source {
             in_file @ Self::InFile { .. } => in_file,
@@ -80,40 +80,40 @@ impl LinkError {
     }
 }
 
-/// Who shares what.
+/// Sharing of the medium.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Medium {
-    /// Every ordered pair of vehicles has a link of its own.
+    /// Every ordered pair of vehicles has its own link.
     #[default]
     PerPair,
     /// All messages share one queue and one rate, as on one radio channel.
     Shared,
 }
 
-/// How many bytes cross in how much time.
+/// Capacity of the link.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum CapacityConfig {
-    /// All at once.
+    /// Unlimited.
     #[default]
     Unlimited,
     /// A token bucket.
     TokenBucket {
         /// Long-run rate, Mbit/s.
         rate_mbps: f64,
-        /// Bytes that may cross at once after a pause.
+        /// Bytes that may be sent at once after a pause.
         #[serde(default)]
         burst_bytes: u64,
     },
     /// Rates over time from a CSV file: `time_s,rate_mbps,delay_ms,loss`.
     Trace(TraceConfig),
-    /// Delivery opportunities of 1,500 bytes each, as mahimahi records them: one line a packet, milliseconds; repeated.
+    /// Delivery opportunities of 1,500 bytes each, in mahimahi's format: one line per packet, milliseconds; repeated.
     Mahimahi(TraceConfig),
 }
 
 impl CapacityConfig {
-    /// The trace that it follows.
+    /// The trace of the capacity.
     pub(super) fn trace(&self) -> Option<&TraceConfig> {
         match self {
             Self::Unlimited | Self::TokenBucket { .. } => None,
@@ -122,17 +122,17 @@ impl CapacityConfig {
     }
 }
 
-/// What happens to those who have to wait.
+/// Queue before the link.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct QueueConfig {
-    /// Bytes that may wait, without the message that is on its way.
+    /// Bytes that may wait, excluding the message that is being sent.
     pub bytes: u64,
-    /// Who goes when there is no room.
+    /// Message that is dropped if the queue is full.
     pub drop: QueueDrop,
-    /// Whether a newer message of the same stream takes the place of one that waits.
+    /// True if a newer message of the same stream replaces one that waits.
     pub keep_newest: bool,
-    /// Messages of at most so many bytes do not wait behind larger ones.
+    /// Messages of at most this many bytes do not wait behind larger ones.
     pub urgent_bytes: u64,
 }
 
@@ -142,31 +142,31 @@ impl Default for QueueConfig {
     }
 }
 
-/// Who goes when there is no room.
+/// Message that is dropped if the queue is full.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum QueueDrop {
-    /// The newcomer.
+    /// The new message.
     #[default]
     Tail,
-    /// Those who have waited longest.
+    /// The oldest messages in the queue.
     Head,
 }
 
-/// The law of the propagation delay, after the last bit was sent.
+/// Model of the propagation delay, after the last bit was sent.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum DelayModel {
     /// None.
     #[default]
     None,
-    /// Always the same, milliseconds.
+    /// Constant, milliseconds.
     ConstantMs(f64),
     /// Between two bounds, milliseconds.
     UniformMs([f64; 2]),
-    /// Normal, cut off at 0.
+    /// Normal, truncated at 0.
     Normal {
-        /// Mean before it is cut off, milliseconds.
+        /// Mean before truncation, milliseconds.
         mean_ms: f64,
         /// Standard deviation, milliseconds.
         std_ms: f64,
@@ -178,29 +178,29 @@ pub enum DelayModel {
         /// Standard deviation of the logarithm.
         sigma: f64,
     },
-    /// What OpenCOOD computes in its mode `real`, without any queue: uniform overhead, time by size, a fixed time.
+    /// OpenCOOD's delay in its mode `real`, without any queue: uniform overhead, time by size, a fixed time.
     BySize {
         /// Largest overhead, milliseconds.
         overhead_ms: f64,
         /// Rate that the size is divided by, Mbit/s.
         rate_mbps: f64,
-        /// What is added in any case, milliseconds.
+        /// Fixed part, milliseconds.
         fixed_ms: f64,
     },
     /// The column of the capacity's trace.
     Trace,
 }
 
-/// The law of loss.
+/// Model of packet loss.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum LossModel {
-    /// Nothing is lost.
+    /// No loss.
     #[default]
     None,
-    /// Each alike.
+    /// Independent losses with one probability.
     Bernoulli(f64),
-    /// A chain of two states (Gilbert 1960, Elliott 1963), one step a message or fragment.
+    /// A Markov chain of two states (Gilbert 1960, Elliott 1963), one step per message or fragment.
     GilbertElliott {
         /// Probability of going from good to bad.
         to_bad: f64,
@@ -213,7 +213,7 @@ pub enum LossModel {
         #[serde(default = "one")]
         loss_bad: f64,
     },
-    /// By the distance between sender and receiver: points of metres and probability, straight lines between them.
+    /// By the distance between sender and receiver: points of metres and probability, interpolated linearly.
     Distance(Vec<[f64; 2]>),
     /// The column of the capacity's trace.
     Trace,
@@ -223,7 +223,7 @@ fn one() -> f64 {
     1.0
 }
 
-/// What is lost at a time.
+/// Unit of loss.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum LossUnit {
@@ -234,17 +234,17 @@ pub enum LossUnit {
     Fragment,
 }
 
-/// Messages that others overtake.
+/// Reordering: messages with an extra delay.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ReorderConfig {
     /// Share of the messages.
     pub probability: f64,
-    /// How much later they come, milliseconds.
+    /// Extra delay, milliseconds.
     pub extra_ms: f64,
 }
 
-/// A time in which nothing crosses, from the beginning of the scene, seconds. What was on its way is lost.
+/// A time without any transmission, from the beginning of the scene, seconds. Messages in flight are lost.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Outage {
@@ -258,39 +258,39 @@ pub struct Outage {
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct LinkConfig {
-    /// Who shares what.
+    /// Sharing of the medium.
     pub medium: Medium,
-    /// How fast bytes cross.
+    /// Rate of the link.
     pub capacity: CapacityConfig,
-    /// Who waits, and who does not get to.
+    /// Queue before the link.
     pub queue: QueueConfig,
-    /// How long a message is under way after its last bit was sent.
+    /// Propagation delay of a message after its last bit was sent.
     pub delay: DelayModel,
-    /// The time from publication to arrival is cut down to a multiple of this, milliseconds; 0 for none. OpenCOOD's
-    /// evaluation knows only whole frames of 100 ms.
+    /// The time from publication to arrival is rounded down to a multiple of this, milliseconds; 0 for none. OpenCOOD's
+    /// evaluation has only whole frames of 100 ms.
     pub floor_ms: f64,
-    /// Whether jitter may not change the order of a sender's messages.
+    /// True if jitter must not change the order of a sender's messages.
     pub keep_order: bool,
-    /// What gets lost.
+    /// Packet loss.
     pub loss: LossModel,
-    /// At a time.
+    /// Unit of loss: a message or a fragment.
     pub loss_unit: LossUnit,
-    /// Messages that others overtake.
+    /// Reordering of messages.
     pub reorder: Option<ReorderConfig>,
     /// Share of the messages that arrive twice.
     pub duplicate: f64,
-    /// When nothing crosses.
+    /// Times without any transmission.
     pub outages: Vec<Outage>,
-    /// The clock of every vehicle but the receiver: what stands in its messages as capture time.
+    /// The clock of every vehicle but the receiver, which sets the capture times of its messages.
     #[serde(skip_serializing_if = "DeviceClock::is_right")]
     pub clock: DeviceClock,
 }
 
 impl LinkConfig {
-    /// Checks every number; files are not looked at.
+    /// Checks every number; files are not opened.
     ///
     /// # Errors
-    /// [`LinkError`] names the first field that is wrong.
+    /// [`LinkError`] with the first invalid field.
     pub fn validate(&self) -> Result<(), LinkError> {
         if let CapacityConfig::TokenBucket { rate_mbps, .. } = self.capacity {
             bounded("capacity.rate_mbps", rate_mbps, 1e-6, 1e6, "1e-6 to 1e6")?;
@@ -356,16 +356,16 @@ impl LinkConfig {
         Ok(())
     }
 
-    /// The file of the trace that the capacity names.
+    /// The file of the capacity's trace.
     #[must_use]
     pub fn trace_file(&self) -> Option<&Path> {
         self.capacity.trace().map(|trace| trace.path.as_path())
     }
 
-    /// The trace that the capacity names; relative paths start at `folder`.
+    /// The capacity's trace; relative paths start at `folder`.
     ///
     /// # Errors
-    /// [`LinkError`] when it is not readable, or has to say what it does not.
+    /// [`LinkError`] if it is not readable, or lacks a column that the link needs.
     pub(super) fn read_trace(&self, folder: &Path) -> Result<Option<Trace>, LinkError> {
         let offset_nanos = self.capacity.trace().map_or(0, TraceConfig::offset_nanos);
         let trace = match &self.capacity {
@@ -384,7 +384,7 @@ impl LinkConfig {
     }
 }
 
-/// Longest delay that is no mistake, milliseconds.
+/// Longest valid delay, milliseconds.
 const MAX_MS: f64 = 600_000.0;
 
 fn time(field: &'static str, ms: f64) -> Result<(), LinkError> {

@@ -50,7 +50,7 @@ mod tests {
         // 1.06 Mbit at 27 Mbit/s take 39.26 ms.
         let by_size = DelayModel::BySize { overhead_ms: 100.0, rate_mbps: 27.0, fixed_ms: 10.0 };
         check(by_size, 50.0 + 39.259_259 + 10.0, 100.0 / 12f64.sqrt());
-        // Nine deviations from 0: nothing is cut off.
+        // Nine standard deviations from 0: no truncation.
         check(DelayModel::Normal { mean_ms: 45.0, std_ms: 5.0 }, 45.0, 5.0);
         let (median, sigma) = (10.0, 0.5f64);
         let mean = median * (0.5 * sigma * sigma).exp();

@@ -1,38 +1,38 @@
-//! The clock of a vehicle, which is not the scene's.
+//! Clock of a vehicle: offset, drift and steps relative to the scene's clock.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// How far a vehicle's clock is off.
+/// Error of a vehicle's clock.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct DeviceClock {
-    /// Ahead of the scene's clock at time 0, milliseconds.
+    /// Offset from the scene's clock at time 0, milliseconds; positive is ahead.
     pub offset_ms: f64,
-    /// Gains so many microseconds a second.
+    /// Drift, microseconds per second.
     pub drift_ppm: f64,
-    /// Is set anew in the middle of the scene.
+    /// A step in the middle of the scene.
     pub step: Option<ClockStep>,
 }
 
-/// Someone, or a time server, sets a clock.
+/// A step of a clock, as a time server or an operator causes it.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ClockStep {
     /// Time since the beginning of the scene, seconds.
     pub at_s: f64,
-    /// Further ahead from then on, milliseconds.
+    /// Additional offset from then on, milliseconds.
     pub by_ms: f64,
 }
 
 impl DeviceClock {
-    /// Whether it shows the scene's time.
+    /// True if it shows the scene's time.
     #[must_use]
     pub fn is_right(&self) -> bool {
         *self == Self::default()
     }
 
-    /// What the vehicle's clock shows at a time of a scene that began at `began_nanos`: at the beginning it is off by
+    /// The time of the vehicle's clock at a time of a scene that began at `began_nanos`: at the beginning it differs by
     /// its offset. Never below 0.
     #[must_use]
     pub fn shown_since(&self, began_nanos: u64, scene_nanos: u64) -> u64 {
@@ -41,7 +41,7 @@ impl DeviceClock {
         u64::try_from(shown.max(0)).unwrap_or(u64::MAX)
     }
 
-    /// How far it is ahead so long after the beginning.
+    /// Offset at a time after the beginning.
     fn ahead_nanos(&self, since_nanos: u64) -> i128 {
         let set = self.step.filter(|step| since_nanos as f64 >= step.at_s * 1e9);
         let offset_ms = self.offset_ms + set.map_or(0.0, |step| step.by_ms);

@@ -1,4 +1,4 @@
-//! All links of a scene.
+//! Link emulator: all links of a scene.
 
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BinaryHeap};
@@ -16,53 +16,53 @@ use super::trace::Trace;
 use support::nanos;
 use support::random::derive_seed;
 
-/// A message as the air sees it.
+/// A message as seen by the link.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Packet {
-    /// The caller's name for it; the air does not look at it.
+    /// The caller's id; not used by the emulator.
     pub id: u64,
-    /// Who sends.
+    /// Sender.
     pub from: CavId,
-    /// Who shall receive.
+    /// Receiver.
     pub to: CavId,
-    /// Which of the sender's streams.
+    /// Stream of the sender.
     pub stream: Stream,
-    /// Its number there.
+    /// Sequence number in the stream.
     pub sequence: u64,
     /// Bytes on the wire, headers included.
     pub bytes: u64,
-    /// When it is offered, nanoseconds since the beginning of the scene.
+    /// Time at which it is submitted, nanoseconds since the beginning of the scene.
     pub offered_nanos: u64,
-    /// Between sender and receiver at that time, metres.
+    /// Distance between sender and receiver at that time, metres.
     pub distance_m: f64,
 }
 
-/// What became of a parcel.
+/// Result for a packet.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Delivery {
-    /// It arrived.
+    /// The packet arrived.
     Arrived {
-        /// Whether it had arrived before.
+        /// True if another copy arrived before.
         is_copy: bool,
-        /// Whether it will arrive once more.
+        /// True if another copy will arrive.
         is_repeated: bool,
     },
-    /// It did not.
+    /// The packet was dropped.
     Dropped(DropReason),
 }
 
-/// A parcel, when its fate was known, and that fate.
+/// A packet with its result and the time of the result.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Outcome {
-    /// Nanoseconds since the beginning of the scene: of the arrival or of the loss.
+    /// Time of the arrival or of the loss, nanoseconds since the beginning of the scene.
     pub nanos: u64,
-    /// Which.
+    /// The packet.
     pub parcel: Packet,
-    /// What became of it.
+    /// Its result.
     pub fate: Delivery,
 }
 
-/// The emulated air: parcels in, outcomes out, in the order of time.
+/// Link emulator: packets in, outcomes out, in order of time.
 #[derive(Debug)]
 pub struct LinkEmulator {
     config: LinkConfig,
@@ -74,25 +74,25 @@ pub struct LinkEmulator {
     under_way: BinaryHeap<Reverse<UnderWay>>,
     outcomes: Vec<Outcome>,
     now_nanos: u64,
-    /// Number of the next outcome, which settles the order of those at the same time.
+    /// Number of the next outcome, which orders outcomes of the same time.
     next: u64,
 }
 
-/// What is known of one direction between two vehicles.
+/// State of one direction between two vehicles.
 #[derive(Debug)]
 struct Direction {
     chance: Chance,
     loss: LossState,
-    /// By stream: the latest arrival.
+    /// Latest arrival by stream, nanoseconds.
     latest_nanos: BTreeMap<Stream, u64>,
 }
 
-/// An outcome that lies ahead.
+/// A future outcome.
 #[derive(Debug)]
 struct UnderWay {
     nanos: u64,
     number: u64,
-    parcel: Packet,
+    packet: Packet,
     fate: Delivery,
 }
 
@@ -117,19 +117,19 @@ impl Ord for UnderWay {
 }
 
 impl LinkEmulator {
-    /// The air that a preset or a YAML file describes; paths of traces start at the file's folder.
+    /// The emulator of a preset or a YAML file; paths of traces start at the file's folder.
     ///
     /// # Errors
-    /// [`LinkError`] names the file and what is wrong with it.
+    /// [`LinkError`] with the file and its fault.
     pub fn open(name: &str, seed: u64) -> Result<Self, LinkError> {
         let (config, folder) = LinkConfig::open(name)?;
         Self::new(config, &folder, seed).map_err(|source| LinkError::in_file(name, source))
     }
 
-    /// The air of a configuration; paths of traces start at `folder`. The same seed gives the same air.
+    /// The emulator of a configuration; paths of traces start at `folder`. The same seed gives the same results.
     ///
     /// # Errors
-    /// [`LinkError`] names the field or the file that is wrong.
+    /// [`LinkError`] with the invalid field or file.
     pub fn new(config: LinkConfig, folder: &Path, seed: u64) -> Result<Self, LinkError> {
         config.validate()?;
         let trace = config.read_trace(folder)?;
@@ -148,34 +148,34 @@ impl LinkEmulator {
         })
     }
 
-    /// The clock of those who send.
+    /// The clock of the senders.
     #[must_use]
     pub fn clock(&self) -> &DeviceClock {
         &self.config.clock
     }
 
-    /// Takes a message. Times never go back: one that is offered before the last one counts as offered with it.
-    pub fn offer(&mut self, mut parcel: Packet) {
-        parcel.offered_nanos = parcel.offered_nanos.max(self.now_nanos);
-        self.run(parcel.offered_nanos);
+    /// Submits a packet. Time never goes back: a packet earlier than the last one counts as submitted with it.
+    pub fn offer(&mut self, mut packet: Packet) {
+        packet.offered_nanos = packet.offered_nanos.max(self.now_nanos);
+        self.run(packet.offered_nanos);
         let key = match self.config.medium {
             Medium::Shared => None,
-            Medium::PerPair => Some((parcel.from.clone(), parcel.to.clone())),
+            Medium::PerPair => Some((packet.from.clone(), packet.to.clone())),
         };
         let mut left = Vec::new();
         let rules = rules(&self.config, &self.capacity);
-        self.lines.entry(key).or_default().offer(parcel, &rules, &mut left);
+        self.lines.entry(key).or_default().offer(packet, &rules, &mut left);
         left.into_iter().for_each(|left| self.settle(left));
         self.collect(self.now_nanos);
     }
 
-    /// Lets time pass until `nanos`; what became known by then comes back in the order of time.
+    /// Advances the time to `nanos`; returns the outcomes up to then in order of time.
     pub fn advance(&mut self, nanos: u64) -> Vec<Outcome> {
         self.run(nanos.max(self.now_nanos));
         std::mem::take(&mut self.outcomes)
     }
 
-    /// When the next outcome can be known; none while nothing is under way.
+    /// Time of the next outcome; `None` if nothing is in flight.
     #[must_use]
     pub fn next_nanos(&self) -> Option<u64> {
         let rules = rules(&self.config, &self.capacity);
@@ -185,7 +185,7 @@ impl LinkEmulator {
         sent.chain(known).chain(ahead).min()
     }
 
-    /// Lines first, in the order of time over all of them, then what arrives meanwhile.
+    /// Queues first, in order of time over all of them, then arrivals.
     fn run(&mut self, until_nanos: u64) {
         loop {
             let rules = rules(&self.config, &self.capacity);
@@ -204,41 +204,41 @@ impl LinkEmulator {
 
     fn collect(&mut self, until_nanos: u64) {
         while self.under_way.peek().is_some_and(|Reverse(under_way)| under_way.nanos <= until_nanos) {
-            let Some(Reverse(UnderWay { nanos, parcel, fate, .. })) = self.under_way.pop() else { return };
-            self.outcomes.push(Outcome { nanos, parcel, fate });
+            let Some(Reverse(UnderWay { nanos, packet, fate, .. })) = self.under_way.pop() else { return };
+            self.outcomes.push(Outcome { nanos, parcel: packet, fate });
         }
     }
 
-    /// Decides about a parcel that has left its queue.
+    /// Decides the result of a packet that has left its queue.
     fn settle(&mut self, left: Departure) {
         match left {
-            Departure::Dropped { parcel, reason, nanos } => self.schedule(nanos, parcel, Delivery::Dropped(reason)),
-            Departure::Sent { parcel, start_nanos, end_nanos } => self.propagate(parcel, start_nanos, end_nanos),
+            Departure::Dropped { packet, reason, nanos } => self.schedule(nanos, packet, Delivery::Dropped(reason)),
+            Departure::Sent { packet, start_nanos, end_nanos } => self.propagate(packet, start_nanos, end_nanos),
         }
     }
 
-    fn propagate(&mut self, parcel: Packet, start_nanos: u64, end_nanos: u64) {
+    fn propagate(&mut self, packet: Packet, start_nanos: u64, end_nanos: u64) {
         let Self { config, trace, seed, directions, .. } = self;
-        let direction = directions.entry((parcel.from.clone(), parcel.to.clone())).or_insert_with(|| Direction {
-            chance: Chance::new(*seed, &parcel.from, &parcel.to),
+        let direction = directions.entry((packet.from.clone(), packet.to.clone())).or_insert_with(|| Direction {
+            chance: Chance::new(*seed, &packet.from, &packet.to),
             loss: LossState::default(),
             latest_nanos: BTreeMap::new(),
         });
-        let stream = label(parcel.stream);
-        let random = |purpose| direction.chance.of(purpose, stream, parcel.sequence);
-        let message = SentMessage { bytes: parcel.bytes, distance_m: parcel.distance_m, sent_nanos: end_nanos };
+        let stream = label(packet.stream);
+        let random = |purpose| direction.chance.of(purpose, stream, packet.sequence);
+        let message = SentMessage { bytes: packet.bytes, distance_m: packet.distance_m, sent_nanos: end_nanos };
         let is_lost =
             direction.loss.loses(&config.loss, config.loss_unit, &message, trace.as_ref(), &mut random(Purpose::Loss));
         if is_lost || config.is_cut(start_nanos, end_nanos) {
-            self.schedule(end_nanos, parcel, Delivery::Dropped(DropReason::LinkLoss));
+            self.schedule(end_nanos, packet, Delivery::Dropped(DropReason::LinkLoss));
             return;
         }
         let delay_nanos = config.delay.draw(&mut random(Purpose::Delay), trace.as_ref(), &message);
-        // Nothing arrives before its last bit was sent, whatever the steps.
-        let arrival_nanos = config.floored(parcel.offered_nanos, end_nanos.saturating_add(delay_nanos));
+        // No packet arrives before its last bit was sent, also with rounding.
+        let arrival_nanos = config.floored(packet.offered_nanos, end_nanos.saturating_add(delay_nanos));
         let mut arrival_nanos = arrival_nanos.max(end_nanos);
         if config.keep_order {
-            let latest = direction.latest_nanos.entry(parcel.stream).or_default();
+            let latest = direction.latest_nanos.entry(packet.stream).or_default();
             arrival_nanos = arrival_nanos.max(*latest);
             *latest = arrival_nanos;
         }
@@ -251,27 +251,27 @@ impl LinkEmulator {
         if config.duplicate > 0.0 && twice.chance(config.duplicate) {
             let again_nanos = config.delay.draw(&mut twice, trace.as_ref(), &message);
             let copy_nanos = arrival_nanos.saturating_add(again_nanos);
-            self.schedule(arrival_nanos, parcel.clone(), Delivery::Arrived { is_copy: false, is_repeated: true });
-            self.schedule(copy_nanos, parcel, Delivery::Arrived { is_copy: true, is_repeated: false });
+            self.schedule(arrival_nanos, packet.clone(), Delivery::Arrived { is_copy: false, is_repeated: true });
+            self.schedule(copy_nanos, packet, Delivery::Arrived { is_copy: true, is_repeated: false });
             return;
         }
-        self.schedule(arrival_nanos, parcel, Delivery::Arrived { is_copy: false, is_repeated: false });
+        self.schedule(arrival_nanos, packet, Delivery::Arrived { is_copy: false, is_repeated: false });
     }
 
-    fn schedule(&mut self, nanos: u64, parcel: Packet, fate: Delivery) {
-        self.under_way.push(Reverse(UnderWay { nanos, number: self.next, parcel, fate }));
+    fn schedule(&mut self, nanos: u64, packet: Packet, fate: Delivery) {
+        self.under_way.push(Reverse(UnderWay { nanos, number: self.next, packet, fate }));
         self.next += 1;
     }
 }
 
 impl LinkConfig {
-    /// Whether an outage lies in a span.
+    /// True if an outage lies in an interval.
     fn is_cut(&self, start_nanos: u64, end_nanos: u64) -> bool {
         let nanos = |seconds: f64| nanos::of_ms(1e3 * seconds);
         self.outages.iter().any(|outage| start_nanos < nanos(outage.to_s) && end_nanos >= nanos(outage.from_s))
     }
 
-    /// Cuts the time since `offered_nanos` down to whole steps, where the link has them.
+    /// Rounds the time since `offered_nanos` down to whole steps, if the link has them.
     fn floored(&self, offered_nanos: u64, arrival_nanos: u64) -> u64 {
         let took_nanos = arrival_nanos.saturating_sub(offered_nanos);
         match nanos::of_ms(self.floor_ms) {
@@ -289,7 +289,7 @@ fn rules<'a>(config: &'a LinkConfig, capacity: &'a Capacity) -> Rules<'a> {
     Rules { capacity, burst_bytes, queue: &config.queue }
 }
 
-/// A number for a stream that stays the same whatever order the streams are listed in.
+/// A number for a stream that does not depend on the order in which the streams are listed.
 fn label(stream: Stream) -> u64 {
     derive_seed(0, &stream.to_string().bytes().map(u64::from).collect::<Vec<_>>())
 }

@@ -1,13 +1,13 @@
-//! The emulated air: what a wireless link does to messages, message by message, above zenoh.
+//! Link emulation: the effect of a wireless link on messages, message by message, above zenoh.
 //!
-//! Stages, in order: queue and rate cap, outages, loss, propagation delay, reordering, duplication. Every decision follows
-//! from the seed, the link and the message's own numbers, so the same messages meet the same fate on either clock, in one
-//! process or in many.
+//! Stages, in order: queue and rate limit, outages, loss, propagation delay, reordering, duplication. Every decision
+//! follows from the seed, the link and the message's own numbers, so the same messages get the same results on either
+//! clock, in one process or in many.
 //!
-//! - [`LinkConfig`]: the stages, with [`LinkConfig::preset`] for links that others have described.
-//! - [`LinkEmulator`]: takes [`Packet`]s and says when and whether they arrive.
-//! - [`node`]: the same between the agents and an ego of a live run.
-//! - [`DeviceClock`]: offset and drift of the clock of those who send, by which their capture times are off.
+//! - [`LinkConfig`]: the stages, with [`LinkConfig::preset`] for published link models.
+//! - [`LinkEmulator`]: takes [`Packet`]s and returns their arrivals and losses.
+//! - `sim_replay::link_node`: the same between the agents and an ego of a live run.
+//! - [`DeviceClock`]: offset and drift of the senders' clock, which shift their capture times.
 
 mod capacity;
 mod chance;

@@ -1,10 +1,10 @@
-//! What gets lost.
+//! Loss models: Bernoulli, Gilbert-Elliott, by distance, or from a trace.
 
 use super::config::{FRAGMENT_BYTES, LossModel, LossUnit};
 use super::trace::Trace;
 use support::random::SplitMix64;
 
-/// The state of loss on one direction of one link.
+/// State of the loss model on one direction of one link.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct LossState {
     is_bad: bool,
@@ -19,7 +19,7 @@ pub(super) struct SentMessage {
 }
 
 impl LossState {
-    /// Whether a message is lost. Messages of a link are asked about in the order they are sent in.
+    /// True if a message is lost. Called for the messages of a link in the order in which they are sent.
     pub(super) fn loses(
         &mut self,
         law: &LossModel,
@@ -55,7 +55,7 @@ impl LossState {
     }
 }
 
-/// The value at `x` of the line through `points`, level beyond both ends; 0 without points.
+/// Linear interpolation through `points` at `x`, constant beyond both ends; 0 without points.
 fn interpolate(points: &[[f64; 2]], x: f64) -> f64 {
     let after = points.partition_point(|point| point[0] <= x);
     match (after.checked_sub(1).map(|before| points[before]), points.get(after)) {
@@ -99,7 +99,8 @@ mod tests {
         let law = LossModel::GilbertElliott { to_bad, to_good, loss_good, loss_bad };
         let bad = to_bad / (to_bad + to_good);
         let expected = bad * loss_bad + (1.0 - bad) * loss_good;
-        // Neighbours are correlated: the variance of the mean grows by (1 + r) / (1 - r) for the part that the state explains.
+        // Neighbours are correlated: the variance of the mean grows by (1 + r) / (1 - r) for the part explained by the
+        // state.
         let r = 1.0 - to_bad - to_good;
         let between = bad * (1.0 - bad) * (loss_bad - loss_good) * (loss_bad - loss_good);
         let within = expected * (1.0 - expected) - between;

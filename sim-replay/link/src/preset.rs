@@ -1,11 +1,11 @@
-//! Links by name: those that others have described, and files.
+//! Links by name: published link models, and files.
 
 use std::path::{Path, PathBuf};
 
 use super::config::{CapacityConfig, DelayModel, LinkConfig, LinkError, LossModel, LossUnit, Medium, QueueConfig};
 use support::bounded_file;
 
-/// Every preset with one line about it.
+/// Every preset with a one-line description.
 pub const PRESETS: [(&str, &str); 6] = [
     ("ideal", "everything arrives at once"),
     ("opencood-sim", "OpenCOOD's constant delay of 100 ms, in whole frames"),
@@ -19,11 +19,10 @@ pub const PRESETS: [(&str, &str); 6] = [
 const MAX_BYTES: u64 = 1 << 20;
 
 impl LinkConfig {
-    /// The link that a preset or a YAML file describes, and the folder that paths in it start at. Checked, but for the
-    /// traces it names.
+    /// The link of a preset or a YAML file, and the folder at which paths in it start. Checked, except for its traces.
     ///
     /// # Errors
-    /// [`LinkError`] names the file and what is wrong with it.
+    /// [`LinkError`] with the file and its fault.
     pub fn open(name: &str) -> Result<(Self, PathBuf), LinkError> {
         let names = PRESETS.map(|(preset, _)| preset);
         if names.contains(&name) {
@@ -42,10 +41,10 @@ impl LinkConfig {
         Ok((config, folder))
     }
 
-    /// A link that others have described, by name.
+    /// A published link model, by name.
     ///
     /// # Errors
-    /// [`LinkError::Preset`] lists the names there are.
+    /// [`LinkError::Preset`] lists the available names.
     pub fn preset(name: &str) -> Result<Self, LinkError> {
         let shaped = |rate_mbps: f64, burst_bytes| CapacityConfig::TokenBucket { rate_mbps, burst_bytes };
         let radio = QueueConfig { bytes: 1 << 20, keep_newest: true, ..QueueConfig::default() };
@@ -84,8 +83,8 @@ impl LinkConfig {
                 loss_unit: LossUnit::Fragment,
                 ..Self::default()
             },
-            // 3GPP TR 22.886 asks for 50 Mbit/s and more per vehicle for extended sensors; measured round trips of public
-            // 5G networks lie near 20 ms with a long tail (Narayanan et al. 2021).
+            // 3GPP TR 22.886 requires 50 Mbit/s and more per vehicle for extended sensors; measured round trips of
+            // public 5G networks are near 20 ms with a long tail (Narayanan et al. 2021).
             "5g-uu" => Self {
                 capacity: shaped(50.0, 64 << 10),
                 queue: radio,

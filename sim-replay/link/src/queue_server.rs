@@ -1,4 +1,4 @@
-//! One queue in front of one sender: who waits, who is on the way, when the last bit of each is sent.
+//! Queue and server of one sender: waiting packets, the packet being sent, and departure times.
 
 use std::collections::VecDeque;
 
@@ -11,7 +11,7 @@ use super::emulator::Packet;
 /// A queue and its sender.
 #[derive(Debug, Clone, Default)]
 pub(super) struct QueueServer {
-    /// All work up to here is used up: what is sent next ends later.
+    /// All work up to here is used: the next packet ends later.
     used: u128,
     /// The same for urgent messages among themselves.
     urgent_used: u128,
@@ -23,22 +23,22 @@ pub(super) struct QueueServer {
 
 #[derive(Debug, Clone)]
 struct Sending {
-    parcel: Packet,
+    packet: Packet,
     start_nanos: u64,
-    /// Its last bit is sent when so much work could have been done.
+    /// Its last bit is sent when this much work could have been done.
     end: u128,
 }
 
-/// What became of a parcel here.
+/// A packet that leaves the queue.
 #[derive(Debug, Clone)]
 pub(super) enum Departure {
-    /// Its first and its last bit were sent at these times.
-    Sent { parcel: Packet, start_nanos: u64, end_nanos: u64 },
-    /// It never was.
-    Dropped { parcel: Packet, reason: DropReason, nanos: u64 },
+    /// Times at which its first and its last bit were sent.
+    Sent { packet: Packet, start_nanos: u64, end_nanos: u64 },
+    /// The packet was dropped in the queue.
+    Dropped { packet: Packet, reason: DropReason, nanos: u64 },
 }
 
-/// The rules of a line.
+/// Parameters of a queue.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Rules<'a> {
     pub(super) capacity: &'a Capacity,
@@ -47,44 +47,44 @@ pub(super) struct Rules<'a> {
 }
 
 impl QueueServer {
-    /// Takes a parcel that is offered now. The line has been advanced to now.
-    pub(super) fn offer(&mut self, parcel: Packet, rules: &Rules<'_>, left: &mut Vec<Departure>) {
-        let nanos = parcel.offered_nanos;
+    /// Submits a packet now. The queue has been advanced to now.
+    pub(super) fn offer(&mut self, packet: Packet, rules: &Rules<'_>, left: &mut Vec<Departure>) {
+        let nanos = packet.offered_nanos;
         if *rules.capacity == Capacity::Unlimited {
-            left.push(Departure::Sent { parcel, start_nanos: nanos, end_nanos: nanos });
+            left.push(Departure::Sent { packet, start_nanos: nanos, end_nanos: nanos });
             return;
         }
         if self.sending.is_none() {
-            self.send(parcel, nanos, rules);
+            self.send(packet, nanos, rules);
             return;
         }
-        if parcel.bytes <= rules.queue.urgent_bytes {
-            self.cut_in(parcel, rules);
+        if packet.bytes <= rules.queue.urgent_bytes {
+            self.cut_in(packet, rules);
             return;
         }
         if rules.queue.keep_newest {
-            self.supersede(&parcel, left);
+            self.supersede(&packet, left);
         }
-        let is_full = |line: &Self| line.waiting_bytes.saturating_add(parcel.bytes) > rules.queue.bytes;
+        let is_full = |line: &Self| line.waiting_bytes.saturating_add(packet.bytes) > rules.queue.bytes;
         while rules.queue.drop == QueueDrop::Head && is_full(self) {
             let Some(oldest) = self.waiting.pop_front() else { break };
             self.waiting_bytes -= oldest.bytes;
-            left.push(Departure::Dropped { parcel: oldest, reason: DropReason::LinkQueue, nanos });
+            left.push(Departure::Dropped { packet: oldest, reason: DropReason::LinkQueue, nanos });
         }
         if is_full(self) {
-            left.push(Departure::Dropped { parcel, reason: DropReason::LinkQueue, nanos });
+            left.push(Departure::Dropped { packet, reason: DropReason::LinkQueue, nanos });
             return;
         }
-        self.waiting_bytes += parcel.bytes;
-        self.waiting.push_back(parcel);
+        self.waiting_bytes += packet.bytes;
+        self.waiting.push_back(packet);
     }
 
-    /// Goes on until `nanos`; who was sent by then is in `left`, in that order.
+    /// Advances to `nanos`; the packets sent by then are added to `left`, in that order.
     pub(super) fn advance(&mut self, nanos: u64, rules: &Rules<'_>, left: &mut Vec<Departure>) {
         while let Some((end_nanos, is_urgent)) = self.next(rules).filter(|(end_nanos, _)| *end_nanos <= nanos) {
             let sent = if is_urgent { self.urgent.pop_front() } else { self.sending.take() };
-            let Some(Sending { parcel, start_nanos, .. }) = sent else { return };
-            left.push(Departure::Sent { parcel, start_nanos, end_nanos });
+            let Some(Sending { packet, start_nanos, .. }) = sent else { return };
+            left.push(Departure::Sent { packet, start_nanos, end_nanos });
             if !is_urgent && let Some(next) = self.waiting.pop_front() {
                 self.waiting_bytes -= next.bytes;
                 self.send(next, end_nanos, rules);
@@ -92,12 +92,12 @@ impl QueueServer {
         }
     }
 
-    /// When the next last bit is sent.
+    /// Time at which the next last bit is sent.
     pub(super) fn next_nanos(&self, rules: &Rules<'_>) -> Option<u64> {
         self.next(rules).map(|(nanos, _)| nanos)
     }
 
-    /// The same, and whether it is an urgent one's.
+    /// The same, with true for an urgent packet.
     fn next(&self, rules: &Rules<'_>) -> Option<(u64, bool)> {
         let end = |sending: &Sending| rules.capacity.time_of(sending.end).map(|nanos| nanos.max(sending.start_nanos));
         let urgent = self.urgent.front().and_then(end).map(|nanos| (nanos, true));
@@ -108,23 +108,23 @@ impl QueueServer {
         }
     }
 
-    fn send(&mut self, parcel: Packet, nanos: u64, rules: &Rules<'_>) {
-        // What could have been sent before now is gone, but for the burst.
+    fn send(&mut self, packet: Packet, nanos: u64, rules: &Rules<'_>) {
+        // Capacity unused before now is lost, except for the burst.
         let idle = rules.capacity.done_by(nanos).saturating_sub(work(rules.burst_bytes));
-        self.used = self.used.max(idle) + work(parcel.bytes);
-        self.sending = Some(Sending { parcel, start_nanos: nanos, end: self.used });
+        self.used = self.used.max(idle) + work(packet.bytes);
+        self.sending = Some(Sending { packet, start_nanos: nanos, end: self.used });
     }
 
-    /// Puts an urgent parcel in between: whoever is being sent ends that much later.
-    fn cut_in(&mut self, parcel: Packet, rules: &Rules<'_>) {
-        let nanos = parcel.offered_nanos;
-        let added = work(parcel.bytes);
+    /// Inserts an urgent packet: the end of the packet being sent is delayed by its duration.
+    fn cut_in(&mut self, packet: Packet, rules: &Rules<'_>) {
+        let nanos = packet.offered_nanos;
+        let added = work(packet.bytes);
         self.urgent_used = self.urgent_used.max(rules.capacity.done_by(nanos)) + added;
         self.used += added;
         if let Some(sending) = &mut self.sending {
             sending.end += added;
         }
-        self.urgent.push_back(Sending { parcel, start_nanos: nanos, end: self.urgent_used });
+        self.urgent.push_back(Sending { packet, start_nanos: nanos, end: self.urgent_used });
     }
 
     fn supersede(&mut self, newer: &Packet, left: &mut Vec<Departure>) {
@@ -133,7 +133,7 @@ impl QueueServer {
             let Some(older) = self.waiting.remove(place) else { return };
             self.waiting_bytes -= older.bytes;
             let nanos = newer.offered_nanos;
-            left.push(Departure::Dropped { parcel: older, reason: DropReason::Superseded, nanos });
+            left.push(Departure::Dropped { packet: older, reason: DropReason::Superseded, nanos });
         }
     }
 }

@@ -1,4 +1,4 @@
-//! Links that somebody has measured.
+//! Link traces: measured rates, delays and losses over time.
 
 use std::path::{Path, PathBuf};
 
@@ -11,36 +11,36 @@ use support::csv_file::{CsvError, CsvFile, CsvRow};
 const HEADER: &str = "time_s,rate_mbps,delay_ms,loss";
 /// Bytes of a mahimahi delivery opportunity.
 pub(super) const OPPORTUNITY_BYTES: u64 = 1500;
-/// Longer files are no traces, bytes.
+/// Longer files are refused, bytes.
 const MAX_FILE_BYTES: u64 = 256 << 20;
 
-/// Why a trace cannot be used.
+/// Reasons why a trace cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum TraceError {
     /// The file or a row of it cannot be used.
     #[error(transparent)]
     Csv(#[from] CsvError),
-    /// A line is not what it must be.
+    /// A line is invalid.
     #[error("{}:{line}: {found:?} must be {must}", path.display())]
     Line {
         /// The file.
         path: PathBuf,
         /// Line number, from 1.
         line: usize,
-        /// What stood there.
+        /// Found text.
         found: String,
-        /// What would be right.
+        /// Valid content.
         must: &'static str,
     },
-    /// It ends before the link is to begin.
+    /// It ends before the start of the link.
     #[error("{}: offset_s is {offset_s}, behind the last line", path.display())]
     Past {
         /// The file.
         path: PathBuf,
-        /// Where the link is to begin, seconds.
+        /// Start of the link in the trace, seconds.
         offset_s: f64,
     },
-    /// There is nothing in it.
+    /// The file has no line of data.
     #[error("{}: no line with numbers", path.display())]
     Empty {
         /// The file.
@@ -48,10 +48,10 @@ pub enum TraceError {
     },
 }
 
-/// The state of a link from one moment on.
+/// The state of a link from a time on.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Step {
-    /// From here on, nanoseconds since the beginning.
+    /// Start of the step, nanoseconds since the beginning.
     pub from_nanos: u64,
     /// Rate, bit/s.
     pub bits_per_s: u64,
@@ -64,18 +64,18 @@ pub struct Step {
 /// A link over time.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Trace {
-    /// Rates, delays and losses; the last step lasts for ever.
+    /// Rates, delays and losses; the last step has no end.
     Steps(Vec<Step>),
-    /// Moments at which 1,500 bytes may cross, nanoseconds, in order; repeated from the last one on.
+    /// Times at which 1,500 bytes may be sent, nanoseconds, in order; repeated after the last one.
     Opportunities(Vec<u64>),
 }
 
 impl Trace {
     /// Reads `time_s,rate_mbps,delay_ms,loss`: one line for every change, times rising, the first at `offset_nanos` or
-    /// before. There the link begins.
+    /// before. The link begins at `offset_nanos`.
     ///
     /// # Errors
-    /// [`TraceError`] names the file and the line.
+    /// [`TraceError`] with the file and the line.
     pub fn read_csv(path: &Path, offset_nanos: u64) -> Result<Self, TraceError> {
         let mut steps: Vec<Step> = Vec::new();
         for row in CsvFile::read(path, HEADER, MAX_FILE_BYTES)?.rows() {
@@ -101,10 +101,10 @@ impl Trace {
         }
     }
 
-    /// Reads delivery opportunities as mahimahi writes them: one line a packet, whole milliseconds that never fall.
+    /// Reads delivery opportunities in mahimahi's format: one line per packet, whole milliseconds that never decrease.
     ///
     /// # Errors
-    /// [`TraceError`] names the file and the line.
+    /// [`TraceError`] with the file and the line.
     pub fn read_mahimahi(path: &Path) -> Result<Self, TraceError> {
         let mut times = Vec::new();
         for (index, line) in read(path)?.lines().enumerate().filter(|(_, line)| !line.trim().is_empty()) {
@@ -116,13 +116,13 @@ impl Trace {
         }
         match times.last() {
             None => Err(TraceError::Empty { path: path.to_owned() }),
-            // A trace lasts as long as its last line says: one that ends at 0 would deliver everything at once.
+            // The length of a trace is its last time: one that ends at 0 would deliver everything at once.
             Some(0) => Err(wrong(path, times.len() - 1, "0", "a last line above 0")),
             Some(_) => Ok(Self::Opportunities(times)),
         }
     }
 
-    /// The step at a time; none for opportunities.
+    /// The step at a time; `None` for opportunities.
     pub(super) fn at(&self, nanos: u64) -> Option<&Step> {
         match self {
             Self::Steps(steps) => steps.get(steps.partition_point(|step| step.from_nanos <= nanos).saturating_sub(1)),
@@ -187,7 +187,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wrong_is_named_with_its_line() {
+    fn faults_are_reported_with_their_line() {
         let header = "time_s,rate_mbps,delay_ms,loss\n";
         for (text, line) in [
             ("1,2,3,0\n", 2),

@@ -1,4 +1,4 @@
-//! Which trace a link follows, and from which of its moments on.
+//! Trace of a link: file and start time.
 
 use std::fmt;
 use std::path::{Path, PathBuf};
@@ -13,7 +13,7 @@ use serde::{Deserialize, Deserializer, Serialize};
 pub struct TraceConfig {
     /// The file.
     pub path: PathBuf,
-    /// The moment of the trace at which the link begins, seconds.
+    /// Time in the trace at which the link begins, seconds.
     pub offset_s: f64,
 }
 
@@ -88,13 +88,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_path_alone_begins_at_the_beginning() {
+    fn a_path_without_offset_begins_at_the_beginning() {
         let read = |text: &str| serde_saphyr::from_str::<TraceConfig>(text);
-        assert_eq!(read("air.csv").unwrap(), TraceConfig::new(Path::new("air.csv")));
-        let later = TraceConfig { offset_s: 90.5, ..TraceConfig::new(Path::new("air.csv")) };
-        assert_eq!(read("{path: air.csv, offset_s: 90.5}").unwrap(), later);
+        assert_eq!(read("link.csv").unwrap(), TraceConfig::new(Path::new("link.csv")));
+        let later = TraceConfig { offset_s: 90.5, ..TraceConfig::new(Path::new("link.csv")) };
+        assert_eq!(read("{path: link.csv, offset_s: 90.5}").unwrap(), later);
         assert_eq!(read(&serde_json::to_string(&later).unwrap()).unwrap(), later);
-        assert!(read("{path: air.csv, ofset_s: 1}").unwrap_err().to_string().contains("ofset_s"));
+        assert!(read("{path: link.csv, ofset_s: 1}").unwrap_err().to_string().contains("ofset_s"));
         assert!(read("{offset_s: 1}").unwrap_err().to_string().contains("path"));
     }
 }

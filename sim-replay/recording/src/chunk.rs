@@ -1,4 +1,4 @@
-//! Messages out of the records that hold them: chunks, packed or not, and messages that stand in none.
+//! Messages from chunks, compressed or not, and from message records outside of chunks.
 
 use std::fs::File;
 use std::io::{self, ErrorKind, Read};
@@ -14,31 +14,31 @@ use mcap::{Channel, MAGIC, McapError, McapResult, Message, parse_record};
 use super::lengths::{self, RECORD_HEAD};
 use super::records::MAX_RECORD_BYTES;
 
-/// Bytes taken from a source at once: a length that is wrong costs no more memory than what is there.
+/// Bytes read from a source at once: an invalid length allocates no more memory than there are bytes.
 const READ_BYTES: usize = 1 << 20;
-/// The record that ends a file before its magic number: where the summary begins, and its checksum.
+/// Footer before the final magic number: position of the summary, and its checksum.
 const FOOTER_LEN: usize = 20;
-/// A summary that claims more than this is not read.
+/// Larger summaries are not read.
 const MAX_SUMMARY_BYTES: u64 = 64 << 20;
 
-/// What channels are called. They are described before their first message, in the same chunk as a rule, and once more in
-/// the summary, which tells of those whose chunk is damaged.
+/// Names of channels. They are described before their first message, usually in the same chunk, and again in the
+/// summary, which also names those whose chunk is damaged.
 #[derive(Debug, Default)]
 pub(super) struct Channels {
-    told: ChannelAccumulator<'static>,
+    declared: ChannelAccumulator<'static>,
     repeated: ChannelAccumulator<'static>,
-    /// Whether the summary lists chunks; `None` where there is no sound one.
+    /// True if the summary lists chunks; `None` if there is no valid one.
     pub(super) has_chunks: Option<bool>,
 }
 
 impl Channels {
-    /// Those that the summary of a file of `size` bytes repeats; none where it has no sound one.
+    /// The channels repeated by the summary of a file of `size` bytes; none if it has no valid one.
     pub(super) fn of_summary(file: &File, size: u64) -> io::Result<Self> {
         let mut channels = Self::default();
         if let Some(summary) = summary(file, size)? {
             let options = LinearReaderOptions::default().with_skip_start_magic(true);
             let mut has_chunks = false;
-            // What stands behind a record that is none of a summary is not used.
+            // Records after one that cannot be in a summary are not used.
             let _ = for_each_record(&summary[..], options, |opcode, data| {
                 has_chunks |= opcode == op::CHUNK_INDEX;
                 add(&mut channels.repeated, opcode, data).map(|()| ControlFlow::Continue(()))
@@ -49,15 +49,15 @@ impl Channels {
     }
 
     pub(super) fn get(&self, id: u16) -> Option<Arc<Channel<'static>>> {
-        self.told.get(id).or_else(|| self.repeated.get(id))
+        self.declared.get(id).or_else(|| self.repeated.get(id))
     }
 
-    /// Adds what a schema or a channel record tells; others tell nothing.
+    /// Adds a schema or a channel record; others are ignored.
     pub(super) fn add(&mut self, opcode: u8, data: &[u8]) -> McapResult<()> {
-        add(&mut self.told, opcode, data)
+        add(&mut self.declared, opcode, data)
     }
 
-    /// The message of a record; `None` where its channel is described nowhere.
+    /// The message of a record; `None` if its channel is not described anywhere.
     pub(super) fn message(&self, record: &[u8]) -> McapResult<Option<Message<'static>>> {
         let Record::Message { header, data } = parse_record(op::MESSAGE, record)? else { return Ok(None) };
         Ok(self.get(header.channel_id).map(|channel| Message {
@@ -82,7 +82,7 @@ fn add(channels: &mut ChannelAccumulator<'static>, opcode: u8, data: &[u8]) -> M
     }
 }
 
-/// The summary of a whole file, once it has been compared with its checksum.
+/// The summary of a complete file, after its checksum was verified.
 fn summary(file: &File, size: u64) -> io::Result<Option<Vec<u8>>> {
     let end_len = (RECORD_HEAD + FOOTER_LEN + MAGIC.len()) as u64;
     let Some(footer_begin) = size.checked_sub(end_len) else { return Ok(None) };
@@ -105,8 +105,8 @@ fn summary(file: &File, size: u64) -> io::Result<Option<Vec<u8>>> {
     Ok((stated == [0; 4] || stated == crc.finalize().to_le_bytes()).then_some(summary))
 }
 
-/// The messages of a chunk, once it has been compared with its checksum, and the number of those whose channel is described
-/// nowhere; its channels are added to `channels`.
+/// The messages of a chunk, after its checksum was verified, and the number of those whose channel is not described
+/// anywhere; its channels are added to `channels`.
 pub(super) fn unpack(body: &[u8], channels: &mut Channels) -> McapResult<(Vec<Message<'static>>, usize)> {
     lengths::check(op::CHUNK, body)?;
     let head = [[op::CHUNK].as_slice(), &(body.len() as u64).to_le_bytes()].concat();
@@ -117,7 +117,7 @@ pub(super) fn unpack(body: &[u8], channels: &mut Channels) -> McapResult<(Vec<Me
         if unpacked_bytes > MAX_RECORD_BYTES {
             return Err(McapError::ChunkTooLarge(unpacked_bytes as u64));
         }
-        // Others have no place in a chunk, and the parser trusts the lengths in some of them.
+        // Other records are not allowed in a chunk, and the parser trusts the lengths in some of them.
         match opcode {
             op::MESSAGE => match channels.message(data)? {
                 Some(message) => messages.push(message),
@@ -130,7 +130,7 @@ pub(super) fn unpack(body: &[u8], channels: &mut Channels) -> McapResult<(Vec<Me
     Ok((messages, orphans))
 }
 
-/// What is wrong, as whoever unpacks says it.
+/// The text of an error, as the decompressor gives it.
 pub(super) fn in_words(error: McapError) -> String {
     match error {
         McapError::Io(source) => source.to_string(),
@@ -138,7 +138,7 @@ pub(super) fn in_words(error: McapError) -> String {
     }
 }
 
-/// Gives the records of `source` to `visit`, one after the other, until it has had enough or there are no more.
+/// Passes the records of `source` to `visit`, one after the other, until it stops or there are no more.
 fn for_each_record(
     mut source: impl Read,
     options: LinearReaderOptions,

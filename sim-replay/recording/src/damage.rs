@@ -4,18 +4,19 @@ use std::fmt;
 
 use serde::Serialize;
 
-/// A part of a recording that is lost: cut off, or with a bit that is not as it was written.
+/// A lost part of a recording: cut off, or with a changed bit.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Damage {
-    /// Where it begins, bytes.
+    /// Start of the part, bytes.
     pub begin_bytes: u64,
-    /// Its length, bytes: of these nothing is read.
+    /// Its length, bytes; none of it is read.
     pub lost_bytes: u64,
-    /// Arrival of the last message before it, seconds since the first of the recording; `None`: there is none before it.
+    /// Arrival of the last message before it, seconds since the first of the recording; `None` if there is none before
+    /// it.
     pub from_s: Option<f64>,
-    /// Arrival of the first message behind it, likewise; `None`: there is none behind it.
+    /// Arrival of the first message after it, likewise; `None` if there is none after it.
     pub to_s: Option<f64>,
-    /// What was found there.
+    /// The fault found there.
     pub reason: String,
 }
 

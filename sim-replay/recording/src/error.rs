@@ -1,42 +1,42 @@
-//! What can be wrong with a recording.
+//! Errors of recordings.
 
 use std::path::{Path, PathBuf};
 
-/// Why a recording cannot be written or read.
+/// Reasons why a recording cannot be written or read.
 #[derive(Debug, thiserror::Error)]
 pub enum RecordingError {
-    /// The operating system refused.
+    /// An error of the operating system.
     #[error("recording {}: {source}", path.display())]
     Io {
         /// The file.
         path: PathBuf,
-        /// What the system says.
+        /// Error of the operating system.
         source: std::io::Error,
     },
-    /// The file is no MCAP file, or none of ours.
+    /// The file is no MCAP file, or not a recording of this program.
     #[error("{}: {reason}", path.display())]
     NotOurs {
         /// The file.
         path: PathBuf,
-        /// What was looked for and found.
+        /// Expected and found content.
         reason: String,
     },
-    /// A record of the file says something that cannot be.
+    /// A record of the file is invalid.
     #[error("{}, byte {offset}: {reason}", path.display())]
     Malformed {
         /// The file.
         path: PathBuf,
-        /// Where the record begins.
+        /// Start of the record, bytes.
         offset: u64,
-        /// What was found and what was expected.
+        /// Found and expected value.
         reason: String,
     },
-    /// Writing failed before; what was written until then is whole.
+    /// Writing failed before; the chunks written until then are complete.
     #[error("recording {} has ended: {reason}", path.display())]
     Ended {
         /// The file.
         path: PathBuf,
-        /// Why it ended.
+        /// Reason of the failure.
         reason: String,
     },
 }

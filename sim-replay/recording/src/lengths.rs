@@ -1,5 +1,5 @@
-//! Lengths that stand in a record, compared with what is there: the `mcap` crate (0.26.0) allocates as much as a text says to
-//! be long, and counts below nothing where a record reaches beyond its chunk.
+//! Checks of lengths in a record against the available bytes: the `mcap` crate (0.26.0) allocates the stated length of
+//! a text, and underflows if a record reaches beyond its chunk.
 
 use mcap::records::op;
 use mcap::{McapError, McapResult};
@@ -13,14 +13,14 @@ const CHUNK_HEAD: usize = 28;
 pub(super) const MESSAGE_HEAD: usize = 22;
 /// Length of the record that ends the data.
 pub(super) const DATA_END_LEN: usize = 4;
-/// Packings of chunks that are read.
+/// Supported compressions of chunks.
 const PACKINGS: [&[u8]; 3] = [b"", b"zstd", b"lz4"];
 
-/// Checks the lengths in a chunk, a schema or a channel. Of a chunk that is packed the records are checked when they are
+/// Checks the lengths in a chunk, a schema or a channel. The records of a compressed chunk are checked when they are
 /// unpacked.
 ///
 /// # Errors
-/// [`McapError::UnexpectedEoc`] where something reaches beyond its record.
+/// [`McapError::UnexpectedEoc`] if a length reaches beyond its record.
 pub(super) fn check(opcode: u8, record: &[u8]) -> McapResult<()> {
     let fits = match opcode {
         op::CHUNK => chunk_fits(record),
@@ -32,7 +32,7 @@ pub(super) fn check(opcode: u8, record: &[u8]) -> McapResult<()> {
     fits.ok_or(McapError::UnexpectedEoc)
 }
 
-/// Whether what is in a record among the data is as long as the record.
+/// True if the contents of a record in the data section fill it exactly.
 pub(super) fn is_filled(opcode: u8, record: &[u8]) -> bool {
     let texts = |head: usize, count: usize| {
         let mut rest = record.get(head..)?;
@@ -48,7 +48,7 @@ pub(super) fn is_filled(opcode: u8, record: &[u8]) -> bool {
         op::MESSAGE => return record.len() >= MESSAGE_HEAD,
         op::CHUNK => texts(CHUNK_HEAD, 1).and_then(long),
         op::MESSAGE_INDEX => texts(2, 1),
-        // Behind its contents stands their checksum.
+        // The contents are followed by their checksum.
         op::ATTACHMENT => texts(16, 2).and_then(long).filter(|rest| rest.len() == 4).map(|_| [].as_slice()),
         op::DATA_END => record.get(DATA_END_LEN..),
         _ => None,
@@ -56,7 +56,7 @@ pub(super) fn is_filled(opcode: u8, record: &[u8]) -> bool {
     rest.is_some_and(<[u8]>::is_empty)
 }
 
-/// Whether a chunk of `len` bytes begins here: its packing is known, and its records fill the rest.
+/// True if a chunk of `len` bytes begins here: its compression is known, and its records fill the rest.
 pub(super) fn is_chunk_head(bytes: &[u8], len: u64) -> bool {
     let Some((packing, rest)) = bytes.get(CHUNK_HEAD..).and_then(text) else { return false };
     let Some((&records_len, _)) = rest.split_first_chunk() else { return false };
@@ -70,7 +70,7 @@ pub(super) fn message(record: &[u8]) -> Option<(u16, &[u8])> {
     Some((u16::from_le_bytes(channel), record.get(MESSAGE_HEAD..)?))
 }
 
-/// The length of one of our messages, as its header tells it; `None` where there is no sound header.
+/// The length of a message of this program, from its header; `None` without a valid header.
 pub(super) fn own_message(payload: &[u8]) -> Option<u64> {
     let header = wire::decode_header([payload]).ok()?;
     header.body_len.checked_add(u64::from(header.metadata_len))?.checked_add(HEADER_LEN as u64)
@@ -104,7 +104,7 @@ fn text(bytes: &[u8]) -> Option<(&[u8], &[u8])> {
     rest.split_at_checked(usize::try_from(u32::from_le_bytes(len)).ok()?)
 }
 
-/// What follows bytes behind their length in 64 bits.
+/// The rest after bytes with a length of 64 bits.
 fn long(bytes: &[u8]) -> Option<&[u8]> {
     let (&len, rest) = bytes.split_first_chunk()?;
     rest.get(usize::try_from(u64::from_le_bytes(len)).ok()?..)
@@ -123,7 +123,7 @@ mod tests {
     }
 
     #[test]
-    fn what_reaches_beyond_its_record_is_refused() {
+    fn a_length_beyond_its_record_is_refused() {
         let word = with_len(b"abc", 3);
         let long = with_len(b"abc", 4);
         let pair = with_len(&[word.clone(), word.clone()].concat(), 14);

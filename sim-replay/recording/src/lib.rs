@@ -1,20 +1,20 @@
-//! A run in a file: everything that was said, in [MCAP](https://mcap.dev), and back out of it.
+//! Recordings of a run: every published message in [MCAP](https://mcap.dev), written and read.
 //!
 //! A recording holds two kinds of channels:
 //!
 //! | topic | encoding | content |
 //! | --- | --- | --- |
-//! | `v2v/<run>/...`, the key | `v2vloc`, or `json` | the message as it was on the wire, byte for byte |
+//! | `v2v/<run>/...`, the key | `v2vloc`, or `json` | the message as transmitted, byte for byte |
 //! | `/<cav>/points`, `/<cav>/pose`, `/<cav>/detections`, `/truth`, `/tf` | `cdr`, schemas `ros2msg` | the same for ROS 2 tools |
 //!
-//! The first are for this program: what is replayed from them is exactly what was recorded. The second are for Foxglove,
-//! Rerun and whatever else reads ROS 2 bags. Log times are the arrival at the recorder on the Unix clock; header stamps
-//! are capture times on the scene's clock.
+//! The first are for this program: a replay publishes exactly the recorded messages. The second are for Foxglove, Rerun
+//! and other readers of ROS 2 bags. Log times are the arrival at the recorder on the Unix clock; header stamps are
+//! capture times on the scene's clock.
 //!
-//! The file grows by whole chunks of at most some MiB or a second, each with its own checksum. One that ends in the middle
-//! of a chunk (power, disk, `kill -9`) reads up to its last whole chunk, one with a bit that is not as it was written reads
-//! but for that chunk ([`Recording::damage`] says what is lost), and [`recover`] makes an indexed file of it again. Files that
-//! other programs have rewritten are read too: packed by zstd or lz4, or with messages that stand in no chunk.
+//! The file grows by whole chunks of at most some MiB or a second, each with its own checksum. A file that ends within
+//! a chunk (power, disk, `kill -9`) is read up to its last whole chunk, a file with a changed bit is read without that
+//! chunk ([`Recording::damage`] lists the losses), and [`recover`] makes an indexed file of it again. Files rewritten
+//! by other programs are read too: compressed by zstd or lz4, or with messages outside of chunks.
 
 mod chunk;
 mod damage;
@@ -35,7 +35,7 @@ pub use recover::{RecoverReport, recover};
 pub use sink::Store;
 pub use writer::{RecordingOptions, RecordingWriter};
 
-/// Encoding of the channels that hold messages as they were on the wire.
+/// Encoding of the channels that hold messages as transmitted.
 pub(crate) const OWN_ENCODING: &str = "v2vloc";
 
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! Reading a recording: whole, cut, or with parts that are damaged.
+//! Reader of recordings: complete, truncated, or with damaged parts.
 
 use std::collections::VecDeque;
 use std::fs::File;
@@ -17,27 +17,27 @@ use super::lengths::{self, RECORD_HEAD};
 use super::records::{RawRecord, Records};
 use super::{OWN_ENCODING, RecordingError};
 
-/// Chunks that are kept unpacked: neighbours in time are neighbours in the file.
+/// Unpacked chunks in the cache: neighbours in time are neighbours in the file.
 const KEPT_CHUNKS: usize = 4;
-/// With more parts than this damaged, nothing more of a file is read.
+/// Reading stops after more damaged parts than this.
 const MAX_DAMAGED: usize = 1000;
 
-/// A message of a recording, where it lies and what its header says.
+/// A message of a recording: its position and its header.
 #[derive(Debug, Clone)]
 pub struct Entry {
-    /// Where it was published.
+    /// Key on which it was published.
     pub key: Key,
     /// Its header.
     pub header: Header,
-    /// When it reached the recorder, nanoseconds on the Unix clock.
+    /// Time of arrival at the recorder, nanoseconds on the Unix clock.
     pub arrived_nanos: u64,
-    /// Which of the records that hold messages.
+    /// Index of the record that holds it.
     holder: usize,
-    /// Which message of it.
+    /// Index of the message in that record.
     place: usize,
 }
 
-/// A record that holds messages: a chunk, or a message that stands in none.
+/// A record that holds messages: a chunk, or a message outside of chunks.
 #[derive(Debug, Clone, Copy)]
 struct Holder {
     begin: u64,
@@ -48,7 +48,7 @@ struct Holder {
 
 type Messages = Arc<Vec<Message<'static>>>;
 
-/// All channels, and the messages that were read last.
+/// All channels, and a cache of the messages read last.
 #[derive(Debug)]
 struct Unpacked {
     channels: Channels,
@@ -67,11 +67,11 @@ pub struct Recording {
 }
 
 impl Recording {
-    /// Opens a recording and looks through all of it once; every chunk is compared with its checksum. Parts that are cut
-    /// off or damaged are left out, see [`Self::damage`].
+    /// Opens a recording and scans all of it once; the checksum of every chunk is verified. Truncated or damaged parts
+    /// are left out, see [`Self::damage`].
     ///
     /// # Errors
-    /// [`RecordingError`] when the file cannot be read or is no recording of ours.
+    /// [`RecordingError`] if the file cannot be read or is no recording of this program.
     pub fn open(path: &Path) -> Result<Self, RecordingError> {
         let io = |source| RecordingError::io(path, source);
         let not_ours = |reason| RecordingError::NotOurs { path: path.into(), reason };
@@ -105,23 +105,23 @@ impl Recording {
         &self.entries
     }
 
-    /// What of the file could not be read, in its order.
+    /// The parts of the file that could not be read, in its order.
     #[must_use]
     pub fn damage(&self) -> &[Damage] {
         &self.damage
     }
 
-    /// The bytes of a message, as they were on the wire.
+    /// The bytes of a message, as transmitted.
     ///
     /// # Errors
-    /// [`RecordingError`] when the file has changed since it was opened.
+    /// [`RecordingError`] if the file has changed since it was opened.
     pub fn read(&self, entry: &Entry) -> Result<Vec<u8>, RecordingError> {
         let messages = self.messages(entry.holder)?;
         let message = messages.get(entry.place).ok_or_else(|| self.changed(entry.holder, "the file has changed"))?;
         Ok(message.data.to_vec())
     }
 
-    /// The messages of whatever channel, in the order of the file. For [`super::recover`].
+    /// The messages of all channels, in the order of the file. For [`super::recover`].
     pub(super) fn all(&self) -> impl Iterator<Item = Result<Messages, RecordingError>> {
         (0..self.holders.len()).map(|holder| self.messages(holder))
     }
@@ -150,21 +150,21 @@ impl Recording {
     }
 }
 
-/// A part of the file that is passed over.
+/// A part of the file that is skipped.
 #[derive(Debug)]
 struct Lost {
     begin: u64,
     end: u64,
-    /// Messages of ours before it.
+    /// Number of messages of this program before it.
     before: usize,
     reason: String,
 }
 
-/// What a first look through a file finds.
+/// Result of scanning a file.
 #[derive(Default)]
 struct Contents {
     channels: Channels,
-    /// Whether there are messages at all, and whether some are ours.
+    /// True if there are messages at all, and true if some are of this program.
     has_any: bool,
     has_own: bool,
     holders: Vec<Holder>,
@@ -173,7 +173,7 @@ struct Contents {
 }
 
 impl Contents {
-    /// Takes all records of a file of `size` bytes, but for what is damaged.
+    /// Reads all records of a file of `size` bytes, except damaged ones.
     fn look_through(&mut self, records: &mut Records<'_>, size: u64) -> std::io::Result<()> {
         loop {
             let begin = records.at();
@@ -206,13 +206,13 @@ impl Contents {
         }
     }
 
-    /// Whether messages stand in chunks: where they do, those of a damaged one are not taken one by one.
+    /// True if messages are in chunks: then those of a damaged chunk are not read one by one.
     fn has_chunks(&self) -> bool {
         let first = self.holders.first().map(|holder| holder.is_chunk);
         self.channels.has_chunks.or(first).unwrap_or(false)
     }
 
-    /// Takes the next record of the file in; ends with the checksum of the data, where it ends them.
+    /// Processes the next record of the file; ends with the checksum of the data section.
     fn take(&mut self, record: &RawRecord<'_>) -> Result<ControlFlow<u32>, String> {
         let RawRecord { begin, opcode, body } = *record;
         let added = match opcode {
@@ -235,14 +235,14 @@ impl Contents {
         added.map(|()| ControlFlow::Continue(())).map_err(in_words)
     }
 
-    /// A message that stands in no chunk has no checksum but its own.
+    /// A message outside of chunks has no checksum but its own.
     fn take_message(&mut self, begin: u64, body: &[u8]) -> Result<mcap::McapResult<()>, String> {
         let message = self.channels.message(body).map_err(in_words)?;
         let message = message.ok_or("a message of a channel that is described nowhere")?;
         if is_own(&message.channel.message_encoding)
             && lengths::own_message(&message.data) != Some(message.data.len() as u64)
         {
-            return Err("a message that is not as long as it says".into());
+            return Err("a message whose length differs from the one in its header".into());
         }
         self.add(Holder { begin, len: body.len(), is_chunk: false }, &[message]);
         Ok(Ok(()))
@@ -255,7 +255,7 @@ impl Contents {
                 continue;
             }
             self.has_own = true;
-            // What was no sound message when it was recorded is none now.
+            // A payload that was no valid message when it was recorded is skipped.
             let header = wire::decode_header([message.data.as_ref()]).ok();
             if let Some((key, header)) = message.channel.topic.parse().ok().zip(header) {
                 let holder = self.holders.len();
@@ -265,7 +265,7 @@ impl Contents {
         self.holders.push(holder);
     }
 
-    /// Notes a part that is passed over; one that goes on where the last ended belongs to it.
+    /// Records a skipped part; one that continues the last one is merged with it.
     fn lose(&mut self, (begin, end): (u64, u64), reason: String) {
         match self.lost.last_mut() {
             Some(last) if last.end == begin && end > begin && last.end > last.begin => last.end = end,
@@ -273,7 +273,7 @@ impl Contents {
         }
     }
 
-    /// Compares the checksum of all data, which is of use where no chunk has one of its own.
+    /// Verifies the checksum of all data, for files without checksums of chunks.
     fn check_whole(&mut self, end: u64, stated: u32, found: u32) {
         if stated != 0 && stated != found && self.lost.is_empty() && self.holders.iter().all(|holder| !holder.is_chunk)
         {

@@ -1,4 +1,4 @@
-//! The records of a recording, one after the other, and where they go on behind a part that is damaged.
+//! Records of a recording in order, and resynchronisation after a damaged part.
 
 use std::fs::File;
 use std::io;
@@ -9,34 +9,34 @@ use protocol::HEADER_LEN;
 
 use super::lengths::{self, RECORD_HEAD};
 
-/// A record that claims more than this is not ours: we close chunks at a few MiB and one message.
+/// A larger record is not of this program: chunks are closed at a few MiB and one message.
 pub(super) const MAX_RECORD_BYTES: usize = 256 << 20;
-/// Bytes that are searched at once.
+/// Bytes searched at once.
 const WINDOW: usize = 1 << 20;
-/// Bytes of a record by which it is known: those before a chunk's records, or those before a message's payload.
+/// Bytes by which a record is recognised: those before a chunk's records, or those before a message's payload.
 const KNOWN_BY: usize = RECORD_HEAD + lengths::MESSAGE_HEAD + HEADER_LEN;
 
-/// A record as it lies in the file.
+/// A record in the file.
 pub(super) struct RawRecord<'a> {
-    /// Where it begins.
+    /// Its start, bytes.
     pub(super) begin: u64,
     pub(super) opcode: u8,
     pub(super) body: &'a [u8],
 }
 
-/// Goes through the records of a file.
+/// Iterates over the records of a file.
 pub(super) struct Records<'a> {
     file: &'a File,
     size: u64,
-    /// Where the next record begins.
+    /// Start of the next record, bytes.
     at: u64,
     body: Vec<u8>,
-    /// Of everything that was read so far.
+    /// Checksum of everything read so far.
     crc: crc32fast::Hasher,
 }
 
 impl<'a> Records<'a> {
-    /// The records of a file of `size` bytes, behind its magic number; `None` where it neither begins nor ends with one.
+    /// The records of a file of `size` bytes, after its magic number; `None` if it neither begins nor ends with one.
     pub(super) fn open(file: &'a File, size: u64) -> io::Result<Option<Self>> {
         let magic_len = mcap::MAGIC.len() as u64;
         let has_magic = |at: u64| -> io::Result<bool> {
@@ -52,17 +52,17 @@ impl<'a> Records<'a> {
         Ok(Some(Self { file, size, at: magic_len, body: Vec::new(), crc }))
     }
 
-    /// Where the next record begins.
+    /// Start of the next record, bytes.
     pub(super) fn at(&self) -> u64 {
         self.at
     }
 
-    /// CRC-32 of the file up to the next record, where nothing was passed over.
+    /// CRC-32 of the file up to the next record, if nothing was skipped.
     pub(super) fn crc(&self) -> u32 {
         self.crc.clone().finalize()
     }
 
-    /// The next record; `None` at the end of the file. Where none can be, the reason, and nothing is read.
+    /// The next record; `None` at the end of the file. If no record can be here, the reason, and nothing is read.
     pub(super) fn next(&mut self) -> io::Result<Result<Option<RawRecord<'_>>, String>> {
         let (begin, left) = (self.at, self.size - self.at);
         if left == 0 {
@@ -87,7 +87,7 @@ impl<'a> Records<'a> {
         self.body.resize(len, 0);
         self.file.read_exact_at(&mut self.body, begin + RECORD_HEAD as u64)?;
         if !lengths::is_filled(opcode, &self.body) {
-            return Ok(Err(format!("a record of kind {opcode:#04x} is not as long as what is in it")));
+            return Ok(Err(format!("a record of kind {opcode:#04x} differs in length from its contents")));
         }
         if opcode != op::DATA_END {
             self.crc.update(&head);
@@ -97,8 +97,8 @@ impl<'a> Records<'a> {
         Ok(Ok(Some(RawRecord { begin, opcode, body: &self.body })))
     }
 
-    /// Goes on at the next chunk or end of the data from `from` on whose lengths agree, or at the next message outside a
-    /// chunk whose channel `is_own` and whose header is sound; else at the end of the file.
+    /// Continues at the next chunk or end of the data from `from` on whose lengths agree, or at the next message
+    /// outside of chunks whose channel `is_own` and whose header is valid; else at the end of the file.
     pub(super) fn seek(&mut self, from: u64, is_own: impl Fn(u16) -> bool) -> io::Result<()> {
         let mut window = Vec::new();
         let mut begin = from;
@@ -125,7 +125,7 @@ fn split_head(head: [u8; RECORD_HEAD]) -> (u8, u64) {
     (opcode, u64::from_le_bytes(len))
 }
 
-/// Whether records of this kind stand among the data.
+/// True if records of this kind occur in the data section.
 fn is_known(opcode: u8) -> bool {
     matches!(
         opcode,
@@ -141,7 +141,7 @@ fn is_known(opcode: u8) -> bool {
     )
 }
 
-/// Whether a record begins here for certain, `left` bytes before the end of the file.
+/// True if a record certainly begins here, `left` bytes before the end of the file.
 fn is_record(bytes: &[u8], left: u64, is_own: &impl Fn(u16) -> bool) -> bool {
     let Some((&head, body)) = bytes.split_first_chunk::<RECORD_HEAD>() else { return false };
     let (opcode, len) = split_head(head);
@@ -161,7 +161,7 @@ fn is_record(bytes: &[u8], left: u64, is_own: &impl Fn(u16) -> bool) -> bool {
     }
 }
 
-/// Whether the bytes behind what seems to be the end of the data are those of a summary or footer.
+/// True if the bytes after an apparent end of the data are those of a summary or footer.
 fn begins_summary(bytes: &[u8]) -> bool {
     bytes.split_first_chunk::<RECORD_HEAD>().is_some_and(|(&head, _)| {
         let (opcode, len) = split_head(head);

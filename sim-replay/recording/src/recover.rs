@@ -1,4 +1,4 @@
-//! A whole, indexed recording from what is left of one.
+//! Recovery: makes a complete, indexed recording from a damaged one.
 
 use std::path::Path;
 
@@ -6,19 +6,19 @@ use serde::Serialize;
 
 use super::{Damage, OWN_ENCODING, Recording, RecordingError, RecordingOptions, RecordingWriter};
 
-/// What was recovered.
+/// Result of a recovery.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct RecoverReport {
     /// Messages of the run, counted once.
     pub messages: u64,
-    /// What is lost; nothing where the recording was whole.
+    /// Lost parts; empty if the recording was complete.
     pub damage: Vec<Damage>,
 }
 
-/// Writes what can be read of the recording `from` into the new file `to`.
+/// Writes the readable part of the recording `from` into the new file `to`.
 ///
 /// # Errors
-/// [`RecordingError`] when `from` holds nothing of ours, or `to` is there already or cannot be written.
+/// [`RecordingError`] if `from` holds no message of this program, or `to` exists already or cannot be written.
 pub fn recover(from: &Path, to: &Path, options: RecordingOptions) -> Result<RecoverReport, RecordingError> {
     let recording = Recording::open(from)?;
     let mut writer = RecordingWriter::create(to, options)?;
@@ -26,7 +26,7 @@ pub fn recover(from: &Path, to: &Path, options: RecordingOptions) -> Result<Reco
     for held in recording.all() {
         for message in held?.iter() {
             let (topic, encoding) = (&message.channel.topic, message.channel.message_encoding.as_str());
-            // The channels for ROS 2 follow from ours.
+            // The channels for ROS 2 are derived from these.
             if matches!(encoding, OWN_ENCODING | "json")
                 && let Ok(key) = topic.parse()
             {

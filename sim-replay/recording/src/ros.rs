@@ -1,6 +1,7 @@
-//! Our messages as ROS 2 has them: clouds, poses and boxes, for Foxglove, Rerun and RViz.
+//! Conversion of messages to ROS 2: clouds, poses and boxes, for Foxglove, Rerun and RViz.
 //!
-//! Frames: `map` is the world, `<cav>/lidar` a LiDAR at the pose that its vehicle believes in, `<cav>/truth` at the true one.
+//! Frames: `map` is the world, `<cav>/lidar` a LiDAR at the pose estimated by its vehicle, `<cav>/truth` at the true
+//! one.
 
 use protocol::{Box3d, CavId, Detection, Message, PointCloud, Pose, Stream, Topic};
 use re_cdr::{CdrWriter, LittleEndian};
@@ -22,9 +23,9 @@ const DELETE_ALL: i32 = 3;
 const DETECTION_RGB: [f32; 3] = [1.0, 0.37, 0.30];
 const TRUTH_RGB: [f32; 3] = [0.25, 0.81, 0.47];
 
-/// How ROS 2 writes its messages: classic CDR.
+/// Encoding of ROS 2 messages: classic CDR.
 type Cdr<'a> = CdrWriter<'a, LittleEndian>;
-/// What stands before it: plain, little-endian, no options.
+/// Encapsulation header: plain CDR, little-endian, no options.
 const CDR_HEADER: [u8; 4] = [0, 1, 0, 0];
 
 /// A message for ROS 2 tools.
@@ -37,13 +38,13 @@ pub(super) struct RosMessage {
     pub(super) cdr: Vec<u8>,
 }
 
-/// Whether ROS 2 has a word for what is published on `topic`.
-pub(super) fn has_word_for(topic: &Topic) -> bool {
+/// True if ROS 2 has a type for the messages of `topic`.
+pub(super) fn has_type_for(topic: &Topic) -> bool {
     let streams = [Stream::Lidar, Stream::Pose, Stream::Detections];
     matches!(topic, Topic::Truth) || matches!(topic, Topic::Stream { stream, .. } if streams.contains(stream))
 }
 
-/// What ROS 2 tools can be told of a message that was published on `topic`; nothing where ROS has no word for it.
+/// The ROS 2 messages for a message published on `topic`; empty if ROS has no type for it.
 pub(super) fn translate(topic: &Topic, capture_nanos: u64, message: &Message) -> Vec<RosMessage> {
     let at = capture_nanos;
     match (topic, message) {
@@ -69,7 +70,7 @@ pub(super) fn translate(topic: &Topic, capture_nanos: u64, message: &Message) ->
             let objects = truth.agents.iter().flat_map(|agent| &agent.objects).filter(|object| seen.insert(object.id));
             let boxes: Vec<_> = objects
                 .map(|object| Marked {
-                    // ROS has 32 bits for it; ids beyond them are shortened, which only a viewer sees.
+                    // ROS has 32 bits for it; larger ids are truncated, which affects viewers only.
                     id: Some(object.id as i32),
                     box3d: Box3d {
                         center_m: object.world_from_object.translation_m,
@@ -137,7 +138,7 @@ fn point_cloud(topic: String, frame_id: &str, nanos: u64, cloud: &PointCloud) ->
         cdr.write_bool(false);
         cdr.write_u32(POINT_STEP);
         cdr.write_u32(count.saturating_mul(POINT_STEP));
-        // All machines this builds for are little-endian, as the header says.
+        // All supported machines are little-endian, as the header states.
         cdr.write_bytes(bytemuck::cast_slice(&cloud.xyzi));
         cdr.write_bool(true);
     })
@@ -161,9 +162,9 @@ fn transforms(nanos: u64, children: &[(String, Pose)]) -> RosMessage {
     })
 }
 
-/// A box and how to show it.
+/// A box with its marker's properties.
 struct Marked {
-    /// `None`: its place in the list.
+    /// Id; `None`: its index in the list.
     id: Option<i32>,
     box3d: Box3d,
     alpha: f32,
@@ -171,7 +172,7 @@ struct Marked {
     text: String,
 }
 
-/// All boxes of a moment: first a marker that takes away those of the moment before.
+/// All boxes of a capture time: the first marker deletes those of the previous one.
 fn markers(topic: String, frame_id: &str, ns: &str, rgb: [f32; 3], nanos: u64, boxes: &[Marked]) -> RosMessage {
     let nothing = Box3d { center_m: [0.0; 3], size_m: [0.0; 3], heading_rad: 0.0 };
     let sweep = Marked { id: Some(0), box3d: nothing, alpha: 0.0, text: String::new() };
@@ -200,7 +201,7 @@ fn marker(
     pose(cdr, &Pose::from_xyz_yaw(box3d.center_m, box3d.heading_rad));
     xyz(cdr, box3d.size_m);
     rgb.into_iter().chain([*alpha]).for_each(|value| cdr.write_f32(value));
-    // Lifetime: until it is taken away.
+    // Lifetime: until it is deleted.
     cdr.write_i32(0);
     cdr.write_u32(0);
     cdr.write_bool(false);
@@ -228,7 +229,7 @@ mod tests {
             transforms(1_000_000_002, &[("ab".into(), Pose::from_xyz_yaw([1.0, 2.0, 3.0], 0.0))]);
         let mut expected = vec![0, 1, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 2, 0, 0, 0];
         expected.extend(b"\x04\0\0\0map\0\x03\0\0\0ab\0");
-        // Numbers stand on multiples of their size, counted from behind the header.
+        // Numbers are aligned to multiples of their size, counted from the end of the header.
         expected.extend([0; 5]);
         expected.extend([1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0].map(f64::to_le_bytes).as_flattened());
         assert_eq!(cdr, expected);

@@ -1,7 +1,7 @@
-//! The ROS 2 message definitions that recordings carry, so that a reader needs no ROS.
+//! ROS 2 message definitions stored in recordings, so that a reader needs no ROS.
 //!
-//! A definition is the fields of the type, then those of every type it is made of, as the MCAP format asks for encoding
-//! `ros2msg`: separated by a line of 80 `=` and a line `MSG: package/Type`.
+//! A definition is the fields of the type, then those of every type it contains, as the MCAP format requires for
+//! encoding `ros2msg`: separated by a line of 80 `=` and a line `MSG: package/Type`.
 
 /// A type: its name and its own fields.
 type Definition = (&'static str, &'static str);
@@ -63,7 +63,7 @@ impl RosType {
         }
     }
 
-    /// Its definition with all that it is made of.
+    /// Its definition with those of all types it contains.
     pub(super) fn definition(self) -> String {
         let (own, parts): (&str, &[Definition]) = match self {
             Self::PointCloud2 => (

@@ -1,14 +1,14 @@
-//! Where the chunks of a recording go.
+//! Output of a recording: complete chunks only.
 
 use std::fs::File;
 use std::io::{self, Write};
 
-/// A place that takes bytes one after the other and can forget the last of them.
+/// An output that appends bytes and can truncate them.
 pub trait Store: Write {
-    /// Forgets everything behind the first `len` bytes.
+    /// Truncates the output to the first `len` bytes.
     ///
     /// # Errors
-    /// As the system says.
+    /// Errors of the operating system.
     fn cut(&mut self, len: u64) -> io::Result<()>;
 }
 
@@ -18,12 +18,12 @@ impl Store for File {
     }
 }
 
-/// Keeps what is written until it is flushed, which is at the end of a chunk, and takes away again what the store took only
-/// a part of: a full disk ends a recording, but never in the middle of something. Nothing is taken after a failure.
+/// Buffers written bytes until a flush, which is at the end of a chunk, and removes what the output took only partly: a
+/// full disk ends a recording, but never within a chunk. Nothing is written after a failure.
 pub(super) struct WholeChunks<S> {
     store: S,
     pending: Vec<u8>,
-    /// Bytes that the store has taken.
+    /// Number of bytes in the output.
     whole: u64,
     has_failed: bool,
 }
@@ -53,7 +53,7 @@ impl<S: Store> Write for WholeChunks<S> {
         } else {
             self.has_failed = true;
             if let Err(error) = self.store.cut(self.whole) {
-                tracing::error!("what was begun of a recording cannot be taken away: {error}");
+                tracing::error!("an incomplete chunk of a recording cannot be removed: {error}");
             }
         }
         self.pending.clear();

@@ -1,4 +1,4 @@
-//! Writing a recording: messages in, whole chunks out.
+//! Writer of recordings: messages in, whole chunks out.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
@@ -14,19 +14,20 @@ use super::ros_schema::RosType;
 use super::sink::{Store, WholeChunks};
 use super::{OWN_ENCODING, RecordingError};
 
-/// A chunk is closed when it holds this much: what a crash costs, beside the last second.
+/// Size at which a chunk is closed: the largest loss of a crash, besides the last second.
 const CHUNK_BYTES: usize = 4 << 20;
-/// What is recorded is told to ROS 2 tools as it is: sweeps in coordinates of a map (UTM, for example) reach further than
-/// a receiver takes.
+/// Recorded data are passed to ROS 2 tools unchanged: sweeps in map coordinates (UTM, for example) exceed the limits of
+/// a receiver.
 const ANY_SIZE: Limits =
     Limits { max_abs_value: f32::MAX, max_points: u64::MAX, max_body_bytes: u64::MAX, ..Limits::DEFAULT };
 
-/// How to write a recording.
+/// Options of a recording.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct RecordingOptions {
-    /// zstd level, 1 to 22; `None`: chunks are not packed. Clouds and maps hardly shrink, and packing costs a core.
+    /// zstd level, 1 to 22; `None`: chunks are not compressed. Clouds and feature maps hardly shrink, and compression
+    /// occupies a core.
     pub zstd_level: Option<u32>,
-    /// Whether to write the channels for ROS 2 tools too.
+    /// True to write the channels for ROS 2 tools too.
     pub with_ros: bool,
 }
 
@@ -38,20 +39,20 @@ impl Default for RecordingOptions {
 
 /// A recording that is being written.
 ///
-/// After an error nothing more is written: what is there is cut down to the last whole chunk, and every further message
-/// is refused with [`RecordingError::Ended`].
+/// After an error nothing more is written: the file is truncated to the last whole chunk, and every further message is
+/// refused with [`RecordingError::Ended`].
 pub struct RecordingWriter<S: Store> {
     path: PathBuf,
     options: RecordingOptions,
     mcap: mcap::Writer<NoSeek<WholeChunks<S>>>,
-    /// By topic.
+    /// Channel id by topic.
     channels: BTreeMap<String, u16>,
-    /// Messages and bytes of the chunk that is open.
+    /// Messages and bytes of the open chunk.
     open: (u64, usize),
     whole_messages: u64,
-    /// Topics with messages that ROS 2 tools are not told of.
-    untold: BTreeSet<Topic>,
-    /// Why nothing more is written.
+    /// Topics with messages that could not be converted to ROS 2.
+    unconverted: BTreeSet<Topic>,
+    /// Reason why nothing more is written.
     ended: Option<String>,
 }
 
@@ -59,7 +60,7 @@ impl RecordingWriter<File> {
     /// Begins a recording in a new file.
     ///
     /// # Errors
-    /// [`RecordingError::Io`], also where the file is there already.
+    /// [`RecordingError::Io`], also if the file exists already.
     pub fn create(path: &Path, options: RecordingOptions) -> Result<Self, RecordingError> {
         let file = File::create_new(path).map_err(|source| RecordingError::io(path, source))?;
         Self::over(file, path, options)
@@ -67,10 +68,10 @@ impl RecordingWriter<File> {
 }
 
 impl<S: Store> RecordingWriter<S> {
-    /// Begins a recording in `store`; `path` names it in errors.
+    /// Begins a recording in `store`; `path` is its name in errors.
     ///
     /// # Errors
-    /// [`RecordingError::Io`] when not even the header can be written.
+    /// [`RecordingError::Io`] if the header cannot be written.
     pub fn over(store: S, path: &Path, options: RecordingOptions) -> Result<Self, RecordingError> {
         let format = WriteOptions::new()
             .profile("ros2")
@@ -90,18 +91,18 @@ impl<S: Store> RecordingWriter<S> {
             channels: BTreeMap::new(),
             open: (0, 0),
             whole_messages: 0,
-            untold: BTreeSet::new(),
+            unconverted: BTreeSet::new(),
             ended: None,
         };
         writer.flush()?;
         Ok(writer)
     }
 
-    /// Writes a message that came on `key` at `arrived_nanos` (Unix clock), as it is and, where ROS 2 has a word for it,
-    /// once more for ROS 2 tools. A payload that is no sound message of ours is written as it is.
+    /// Writes a message that arrived on `key` at `arrived_nanos` (Unix clock), unchanged and, if ROS 2 has a type for
+    /// it, once more for ROS 2 tools. A payload that is no valid message is written unchanged.
     ///
     /// # Errors
-    /// [`RecordingError`] when the message, and with it the chunk that it would have gone into, is not written.
+    /// [`RecordingError`] if the message, and with it its chunk, is not written.
     pub fn write(&mut self, key: &Key, arrived_nanos: u64, payload: &[u8]) -> Result<(), RecordingError> {
         self.check_open()?;
         let added = self.add(key, arrived_nanos, payload);
@@ -129,7 +130,7 @@ impl<S: Store> RecordingWriter<S> {
         Ok(())
     }
 
-    /// Ends the chunk that is open: everything written so far will be there whatever becomes of this process.
+    /// Ends the open chunk: everything written so far survives a crash of this process.
     ///
     /// # Errors
     /// As [`Self::write`].
@@ -141,7 +142,7 @@ impl<S: Store> RecordingWriter<S> {
         Ok(())
     }
 
-    /// Messages in whole chunks: those that can be read back. What is told to ROS 2 tools is not counted again.
+    /// Messages in whole chunks: those that can be read back. Their copies for ROS 2 are not counted again.
     #[must_use]
     pub fn whole_messages(&self) -> u64 {
         self.whole_messages
@@ -159,7 +160,7 @@ impl<S: Store> RecordingWriter<S> {
         Ok(())
     }
 
-    /// The channel of a topic, declared when it is first needed.
+    /// The channel of a topic, declared on first use.
     fn channel(&mut self, topic: &str, encoding: &str, ros: Option<RosType>) -> McapResult<u16> {
         if let Some(id) = self.channels.get(topic) {
             return Ok(*id);
@@ -173,15 +174,16 @@ impl<S: Store> RecordingWriter<S> {
         Ok(id)
     }
 
-    /// A message for ROS 2 tools; none where ROS has no word for it. One that is not sound is named, once for its topic.
+    /// The ROS 2 messages of a message; none if ROS has no type for it. An invalid message is reported, once for its
+    /// topic.
     fn translated(&mut self, key: &Key, payload: &[u8]) -> Vec<RosMessage> {
-        if !ros::has_word_for(&key.topic) {
+        if !ros::has_type_for(&key.topic) {
             return Vec::new();
         }
         match wire::decode_any([payload], &ANY_SIZE) {
             Ok((header, message)) => ros::translate(&key.topic, header.stamp.capture_nanos, &message),
             Err(error) => {
-                if self.untold.insert(key.topic.clone()) {
+                if self.unconverted.insert(key.topic.clone()) {
                     tracing::warn!("{key}: recorded as it came, but not for ROS 2 tools: {error}");
                 }
                 Vec::new()
@@ -205,8 +207,8 @@ impl<S: Store> RecordingWriter<S> {
     }
 }
 
-/// How the messages of a topic are encoded. The topic alone decides: a first message that is none must not spoil those
-/// after it.
+/// Encoding of the messages of a topic. The topic alone decides: an invalid first message must not affect those after
+/// it.
 fn encoding_of(topic: &Topic) -> &'static str {
     match topic {
         Topic::Stream { stream, .. } | Topic::Received { stream, .. } if stream.kind().is_none() => "json",

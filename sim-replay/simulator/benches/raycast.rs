@@ -1,7 +1,7 @@
-//! How fast sweeps are cast on one core, noise and de-skewing included.
+//! Ray casting throughput on one core, noise and de-skewing included.
 //!
-//! The bar: four sensors at 20 Hz with 50,000 points each in real time, that is 4 million points a second.
-//! `cargo bench -p sim-replay --bench cast -- sweep/town1` runs one case.
+//! Target: four sensors at 20 Hz with 50,000 points each in real time, that is 4 million points a second.
+//! `cargo bench -p simulator --bench raycast -- sweep/town1` runs one case.
 
 use std::hint::black_box;
 
@@ -17,7 +17,7 @@ use support::random::SplitMix64;
 const SPACING_M: f64 = 20.0;
 const RANGE_M: f64 = 120.0;
 
-/// The lane and the place on it from which the town is seen.
+/// The lane and the position on it of the sensor.
 fn sensor_motion(town: &Town) -> Sweep {
     let center = |lane: &&simulator::map::Lane| {
         let [x, y, _] = lane.at(0.5 * lane.length_m).0;

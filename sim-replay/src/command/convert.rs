@@ -9,12 +9,12 @@ use support::progress;
 
 use support::cli::Outcome;
 
-/// Problems that are printed; all are counted, and stand in the JSON summary.
+/// Problems that are printed; all are counted, and included in the JSON summary.
 const SHOWN_PROBLEMS: usize = 10;
 
-/// Write a data set in another layout: sweeps, poses and boxes stay what they are, as far as the layout holds them.
+/// Write a data set in another layout: sweeps, poses and boxes are unchanged, as far as the layout can hold them.
 ///
-/// The layout of the input is found out, as by `inspect`.
+/// The layout of the input is detected, as by `inspect`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
     /// The data set, split, scenario or sequence, or a recording.
@@ -25,10 +25,11 @@ pub(crate) struct Args {
     /// Layout of the files.
     #[arg(long, value_enum)]
     layout: SceneLayout,
-    /// Number that stored intensities are divided by [default: by the type and the range of the numbers, as inspect shows].
+    /// Number that stored intensities are divided by [default: by the type and the range of the numbers, as shown by
+    /// inspect].
     #[arg(long, value_name = "auto|1|255|NUMBER", default_value_t, hide_default_value = true)]
     intensity_scale: IntensityScale,
-    /// Write into a folder that is not empty; what the layout writes there is replaced.
+    /// Write into a folder that is not empty; existing files of the layout are replaced.
     #[arg(long)]
     force: bool,
     /// Print a JSON summary.
@@ -48,7 +49,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     };
     if overlap(&args.from, &args.out) {
         output::note(format_args!(
-            "error: {}: the input lies there; take another folder for --out",
+            "error: {}: the input is in this folder; choose another folder for --out",
             args.out.display()
         ));
         return Ok(Outcome::BadInput);
@@ -73,7 +74,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     }
 }
 
-/// Whether one of the two lies in the other: what is read would be replaced.
+/// True if one of the two contains the other: the input would be overwritten.
 fn overlap(from: &Path, out: &Path) -> bool {
     let real = |path: &Path| path.canonicalize().ok();
     real(from).zip(real(out)).is_some_and(|(from, out)| from.starts_with(&out) || out.starts_with(&from))

@@ -1,4 +1,4 @@
-//! `sim-replay inspect`: what is in a dataset, and what is wrong with it.
+//! `sim-replay inspect`: contents and faults of a dataset.
 
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
@@ -12,14 +12,14 @@ use support::progress;
 
 use support::cli::Outcome;
 
-/// Say what a dataset holds (agents, frames, points, rates, boxes, merged ground truth) and what is wrong with it.
+/// Report the contents of a dataset (agents, frames, points, rates, boxes, merged ground truth) and its faults.
 #[derive(Debug, clap::Args)]
-#[command(after_help = format!("Layouts, and the files that decide:\n{}", layouts_text()))]
+#[command(after_help = format!("Layouts, and the files that identify them:\n{}", layouts_text()))]
 pub(crate) struct Args {
-    /// Dataset, split, scenario or sequence, whose layout is found out; or an OpenDRIVE map (.xodr).
+    /// Dataset, split, scenario or sequence, whose layout is detected; or an OpenDRIVE map (.xodr).
     dir: PathBuf,
-    /// Number that stored intensities are divided by [default: 255 for bytes and red; of other numbers the range of each
-    /// agent's first sweeps tells: up to 1 as they are, up to 255 by 255].
+    /// Number that stored intensities are divided by [default: 255 for bytes and red; other numbers by the range of
+    /// each agent's first sweeps: up to 1 unchanged, up to 255 by 255].
     #[arg(long, value_name = "auto|1|255|NUMBER", default_value_t, hide_default_value = true)]
     intensity_scale: IntensityScale,
     #[command(flatten)]
@@ -39,7 +39,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     Ok(if report.problems.is_empty() { Outcome::Done } else { Outcome::BadInput })
 }
 
-/// Prints what a map holds to standard output.
+/// Prints the contents of a map to standard output.
 fn run_map(path: &Path, json: bool) -> anyhow::Result<Outcome> {
     let report = match inspect_map(path) {
         Ok(report) => report,
@@ -52,7 +52,7 @@ fn run_map(path: &Path, json: bool) -> anyhow::Result<Outcome> {
     Ok(Outcome::Done)
 }
 
-/// As JSON, or as the table that it is displayed as.
+/// As JSON, or as a table.
 fn print(report: &(impl Serialize + Display), json: bool) -> anyhow::Result<()> {
     if json {
         output::line(serde_json::to_string_pretty(report)?)?;
@@ -62,9 +62,9 @@ fn print(report: &(impl Serialize + Display), json: bool) -> anyhow::Result<()> 
     Ok(())
 }
 
-/// Reads everything; a bar on a terminal says how far.
+/// Reads everything, with a progress bar on a terminal.
 fn with_progress(args: &Args) -> Report {
-    // Hidden by itself where stderr is no terminal.
+    // The bar hides itself if stderr is no terminal.
     let bar = progress::bar(0, "frames");
     let options = OpenOptions { intensity_scale: args.intensity_scale, ..OpenOptions::default() };
     let report = inspect(&args.dir, &options, &args.protocol, &|done, total| {

@@ -1,4 +1,4 @@
-//! `sim-replay link`: the emulated air between the agents of a run and an ego.
+//! `sim-replay link`: link emulation between the agents of a run and an ego.
 
 use anyhow::Context;
 use bus::{Configured, STOP_LIMIT, log_to_stderr};
@@ -10,7 +10,7 @@ use support::output;
 
 use support::cli::Outcome;
 
-/// Carry what agents send to an ego, as a wireless link would: late, in a queue, or not at all.
+/// Forward the agents' messages to an ego as a wireless link would: delayed, queued or lost.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
     #[command(flatten)]
@@ -20,15 +20,15 @@ pub(crate) struct Args {
     json: bool,
 }
 
-/// Carries messages and prints a summary to standard output.
+/// Forwards messages and prints a summary to standard output.
 pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
     log_to_stderr();
     let config = match args.config.validated() {
         Ok(config) => config,
         Err(error) => return Ok(Outcome::bad_input(&error)),
     };
-    let air = match LinkEmulator::open(&config.link.model, config.link.seed) {
-        Ok(air) => air,
+    let emulator = match LinkEmulator::open(&config.link.model, config.link.seed) {
+        Ok(emulator) => emulator,
         Err(error) => return Ok(Outcome::bad_input(&error)),
     };
     let stop = config.bus.stop().context("installing signal handlers")?;
@@ -38,7 +38,7 @@ pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
         inbox: config.inbox.limits(),
         ..NodeOptions::new(config.ego, config.streams)
     };
-    let report = link_node::run(&bus, air, &options, &stop)?;
+    let report = link_node::run(&bus, emulator, &options, &stop)?;
     print(&report, args.json)?;
     if let Err(overdue) = bus.leave(STOP_LIMIT) {
         tracing::warn!("{overdue}");
@@ -53,16 +53,16 @@ fn print(report: &LinkReport, as_json: bool) -> anyhow::Result<()> {
     }
     let LinkReport { offered, arrived, copies, under_way, longest_ms, dropped } = report;
     output::line(format_args!(
-        "{offered} messages: {arrived} arrived, {copies} of them twice, {under_way} still under way"
+        "{offered} messages: {arrived} arrived, {copies} of them twice, {under_way} still in flight"
     ))?;
     for (reason, count) in dropped {
         output::line(format_args!("{count} dropped: {reason}"))?;
     }
-    // What the run lost stands last.
+    // The losses of the run are printed last.
     if !report.is_complete() {
         let seconds = *longest_ms as f64 * 1e-3;
         output::line(format_args!(
-            "{under_way} of {offered} messages were still under way at the end, the oldest for {seconds:.1} s"
+            "{under_way} of {offered} messages were still in flight at the end, the oldest for {seconds:.1} s"
         ))?;
     }
     Ok(())

@@ -1,4 +1,4 @@
-//! `sim-replay record`: a live run into a file.
+//! `sim-replay record`: records a live run into a file.
 
 use anyhow::Context;
 use bus::{Configured, STOP_LIMIT, log_to_stderr};
@@ -9,9 +9,9 @@ use support::output;
 
 use support::cli::Outcome;
 
-/// Write everything that is said in a run into an MCAP file, which `sim-replay stream` plays and Foxglove opens.
+/// Write all messages of a run into an MCAP file, which `sim-replay stream` replays and Foxglove opens.
 ///
-/// Ends when the replay does, or on Ctrl-C. A file that was cut short plays up to its last whole chunk.
+/// Ends when the replay does, or on Ctrl-C. A truncated file can be replayed up to its last whole chunk.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
     #[command(flatten)]
@@ -31,7 +31,7 @@ pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
     let stop = config.bus.stop().context("installing signal handlers")?;
     let bus = config.bus.join(&config.run, Role::Recorder, &CavId::new("recorder")?)?;
     let options = config.options();
-    // Who waits for the report is told at once of a failure; the last line counts.
+    // A failure is reported at once to a process that waits for the report; the last line is the final report.
     let mut on_failure = |report: &RecordReport| {
         if args.json && serde_json::to_string(report).map_err(Into::into).and_then(output::line).is_err() {
             tracing::error!("the failure cannot be printed");

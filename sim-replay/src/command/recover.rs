@@ -1,4 +1,4 @@
-//! `sim-replay recover`: an indexed recording from what is left of one.
+//! `sim-replay recover`: makes an indexed recording from a damaged one.
 
 use std::path::PathBuf;
 
@@ -8,12 +8,12 @@ use support::output;
 
 use support::cli::Outcome;
 
-/// Copy what is whole of a recording that was cut short (power, disk, kill) or damaged into a new, indexed file.
+/// Copy the readable part of a truncated (power, disk, kill) or damaged recording into a new, indexed file.
 ///
-/// `stream` plays such a recording as it is; other programs want the index.
+/// `stream` replays such a recording as it is; other programs need the index.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// The recording that was cut or damaged.
+    /// The truncated or damaged recording.
     from: PathBuf,
     /// The new file.
     #[arg(long, value_name = "FILE.mcap")]
@@ -26,7 +26,7 @@ pub(crate) struct Args {
     json: bool,
 }
 
-/// Copies and says what was lost.
+/// Copies and reports the losses.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     log_to_stderr();
     let options = RecordingOptions { with_ros: !args.plain, ..RecordingOptions::default() };

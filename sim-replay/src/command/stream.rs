@@ -1,4 +1,4 @@
-//! `sim-replay stream`: a scene as live traffic.
+//! `sim-replay stream`: publishes a scene as live traffic.
 
 use std::collections::BTreeMap;
 
@@ -14,11 +14,11 @@ use support::cli::Outcome;
 
 /// Publish a scene as if its vehicles were driving now.
 ///
-/// The clock starts when all expected routes have carried a probe. While it runs, control messages (`pause`, `resume`,
-/// `step`, `seek`, `start` with another rate) steer it.
+/// The clock starts when all expected routes have carried a probe. While it runs, it obeys control messages (`pause`,
+/// `resume`, `step`, `seek`, `start` with another rate).
 ///
-/// Where the clock keeps its own pace, a newer sweep takes the place of one that still waits for the network: the last line
-/// says how many. Exit code 3 is for frames that cannot be read and ticks that are not answered.
+/// With a rate above 0 and without lockstep, a newer sweep replaces one that still waits for the network: the summary
+/// counts them. Exit code 3 is for frames that cannot be read and ticks that are not answered.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
     #[command(flatten)]
@@ -103,7 +103,7 @@ fn print(report: &StreamReport, as_json: bool) -> anyhow::Result<()> {
     }
     if report.absent_frames > 0 {
         output::line(format_args!(
-            "{} frames do not exist: their vehicles came later or have left",
+            "{} frames do not exist: their vehicles joined later or have left",
             report.absent_frames
         ))?;
     }
@@ -117,7 +117,7 @@ fn print(report: &StreamReport, as_json: bool) -> anyhow::Result<()> {
         let unsent: u64 = report.unsent.values().sum();
         output::line(format_args!("{unsent} of the messages were not sent{}", by_reason(&report.unsent)))?;
     }
-    // What the run lost stands last.
+    // The losses of the run are printed last.
     if report.unreadable_frames > 0 {
         output::line(format_args!("{} frames could not be read", report.unreadable_frames))?;
     }

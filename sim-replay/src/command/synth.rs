@@ -21,10 +21,10 @@ const PRINTED_FINDINGS: usize = 20;
 /// Seeds 0 to 999 are for training and validation, seeds from 1000 on for measuring only.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Which subset of V2VLoc to imitate: one agent on several traversals of a town, or several agents together.
+    /// Subset of V2VLoc to imitate: one agent on several traversals of a map, or several agents together.
     #[arg(long, value_enum)]
     subset: Subset,
-    /// Fixes routes, lanes, speeds, traffic, parked vehicles and noise.
+    /// Determines routes, lanes, speeds, traffic, parked vehicles and noise.
     #[arg(long)]
     seed: u64,
     /// Folder for the scenarios; made if missing.
@@ -36,10 +36,10 @@ pub(crate) struct Args {
     /// town1, town4 or an OpenDRIVE map (.xodr). By default that of the subset; v2vdet takes both in turn.
     #[arg(long, value_parser = parse_town)]
     town: Option<TownSource>,
-    /// Fixes roads, buildings, trees and signs.
+    /// Determines roads, buildings, trees and signs.
     #[arg(long, default_value_t = 0)]
     town_seed: u64,
-    /// Scenarios of town1loc and town4loc, each another drive through the town.
+    /// Scenarios of town1loc and town4loc, each another drive through the map.
     #[arg(long, default_value_t = 1)]
     traversals: usize,
     /// Scenarios of v2vdet.
@@ -51,8 +51,9 @@ pub(crate) struct Args {
     /// The weather of all scenarios.
     #[arg(long, value_enum, default_value_t)]
     weather: Weather,
-    /// Write every sweep in these weathers too, beside the plain one and named as in V2X-R: fog, snow or both. Points in
-    /// the air have 1 in the green byte of their colour, all others 0. What is annotated is what the plain sweep hits.
+    /// Write every sweep in these weathers too, beside the plain one and named as in V2X-R: fog, snow or both. Clutter
+    /// points (fog, snow) have 1 in the green byte of their colour, all others 0. Annotations are the objects hit by
+    /// the plain sweep.
     #[arg(long, value_enum, value_delimiter = ',', value_name = "WEATHER")]
     copies: Vec<Weather>,
     /// Frames of each scenario [default: 60 for v2vdet, 2000 for the others].
@@ -61,8 +62,8 @@ pub(crate) struct Args {
     /// Simulated seconds from one frame to the next, a multiple of 0.05.
     #[arg(long, default_value_t = 0.1)]
     period: f64,
-    /// Write into a folder that is not empty; scenarios of the same name are replaced, and so is what layouts keep in common
-    /// folders for all scenarios.
+    /// Write into a folder that is not empty; scenarios of the same name are replaced, and so are the common files of
+    /// all scenarios.
     #[arg(long)]
     force: bool,
     /// Print a JSON summary.
@@ -113,7 +114,7 @@ fn options(args: Args) -> SynthOptions {
     }
 }
 
-/// Names on standard error what was not built as the map gives it.
+/// Prints the parts that were not built as the map gives them to standard error.
 fn print_findings(summary: &Summary) {
     for finding in summary.findings.iter().take(PRINTED_FINDINGS) {
         output::note(format_args!("map: {finding}"));
@@ -145,7 +146,7 @@ fn print(summary: &Summary, options: &SynthOptions, seconds: f64, json: bool) ->
     print_omitted(omitted)
 }
 
-/// What a layout had no place for.
+/// Prints the data that a layout cannot hold.
 pub(super) fn print_omitted(omitted: &BTreeMap<&'static str, u64>) -> io::Result<()> {
     omitted.iter().try_for_each(|(what, count)| output::line(format_args!("not in this layout: {count} {what}")))
 }

@@ -26,11 +26,11 @@ pub struct LinkProcessConfig {
     #[arg(long, value_name = "STREAMS", value_delimiter = ',')]
     #[serde(default = "feature_streams")]
     pub streams: Vec<Stream>,
-    /// Go on when all agents have ended, for the next ones; always so with `supervised`.
+    /// Continue when all agents have ended, for the next ones; always so with `supervised`.
     #[arg(long)]
     #[serde(default)]
     pub keep_running: bool,
-    /// Limits of what other vehicles send.
+    /// Limits of messages from other vehicles.
     #[command(flatten)]
     #[serde(default)]
     pub inbox: InboxConfig,
@@ -69,7 +69,7 @@ fn link_help() -> String {
 }
 
 impl LinkSelection {
-    /// Whether the model is one that comes with the program, and no file.
+    /// True if the model is a preset, and no file.
     #[must_use]
     pub fn is_preset(&self) -> bool {
         PRESETS.iter().any(|(name, _)| *name == self.model)

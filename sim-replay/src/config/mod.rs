@@ -1,4 +1,5 @@
-//! Configurations of the processes of this crate: replay, link emulation, recorder. One type each for file, options and schema.
+//! Configurations of the processes of this crate: replay, link emulation, recorder. One type each for file, options and
+//! schema.
 
 mod link;
 mod recorder;

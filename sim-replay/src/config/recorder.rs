@@ -25,7 +25,7 @@ pub struct RecorderConfig {
     #[command(flatten)]
     #[serde(default)]
     pub record: RecordingConfig,
-    /// Go on when the replay ends, for the next one; always so with `supervised`.
+    /// Continue when the replay ends, for the next one; always so with `supervised`.
     #[arg(long)]
     #[serde(default)]
     pub keep_running: bool,
@@ -42,10 +42,10 @@ pub struct RecordingConfig {
     /// Streams to leave out, for example bev, which is most of the bytes.
     #[arg(long, value_delimiter = ',', value_name = "STREAM")]
     pub without: Vec<Stream>,
-    /// Leave out the channels for ROS 2 tools: half as large, and still exactly what was published.
+    /// Leave out the channels for ROS 2 tools: half the size, and still exactly the published messages.
     #[arg(long)]
     pub plain: bool,
-    /// zstd level, 1 to 22. Absent: not compressed; clouds and maps hardly shrink.
+    /// zstd level, 1 to 22. Absent: not compressed; clouds and feature maps hardly shrink.
     #[arg(long, value_name = "LEVEL")]
     #[schemars(range(min = 1, max = 22))]
     pub zstd_level: Option<u32>,
@@ -55,7 +55,7 @@ impl RecordingConfig {
     /// Checks the values.
     ///
     /// # Errors
-    /// [`FieldError`] for the first that is not allowed.
+    /// [`FieldError`] for the first invalid value.
     pub fn validate(&self) -> Result<(), FieldError> {
         within("record.zstd_level", self.zstd_level.unwrap_or(1), 1, 22)
     }
@@ -71,7 +71,7 @@ impl ProcessConfig for RecorderConfig {
 }
 
 impl RecorderConfig {
-    /// The same as the recorder takes it.
+    /// The options of the recorder.
     #[must_use]
     pub fn options(&self) -> RecorderOptions {
         let RecordingConfig { without, plain, zstd_level } = self.record.clone();

@@ -21,7 +21,8 @@ pub struct ReplayConfig {
     /// Name of the run: 1 to 32 characters of a-z, 0-9, '_' and '-'.
     #[arg(long, required_unless_present = "config")]
     pub run: RunId,
-    /// Checkpoint: note here after each tick how far the replay is, and resume from there where the file exists.
+    /// Checkpoint: file to which the state of the replay is written after each tick, and from which it resumes if the
+    /// file exists.
     #[arg(long, value_name = "FILE")]
     #[serde(default)]
     pub bookmark: Option<PathBuf>,
@@ -50,13 +51,14 @@ pub struct WaitConfig {
     /// Wait for the vehicles' agents before the clock starts.
     #[arg(long)]
     pub await_agents: bool,
-    /// A further route that has to stand before the clock starts, TOPIC>PROCESS, for example 4288/bev>ego-4279; repeatable.
+    /// A further route that must be up before the clock starts, TOPIC>PROCESS, for example 4288/bev>ego-4279;
+    /// repeatable.
     #[arg(long, value_name = "ROUTE", allow_hyphen_values = true)]
     pub expect: Vec<Route>,
     /// Longest time to wait for all routes, seconds.
     #[arg(long, value_name = "S")]
     pub ready_timeout_s: f64,
-    /// Egos whose detections of a tick are waited for in lockstep.
+    /// Egos whose detections of a tick are awaited in lockstep.
     #[arg(long, value_name = "IDS", value_delimiter = ',', allow_hyphen_values = true)]
     pub egos: Vec<CavId>,
     /// Longest time to wait for an ego's detections in lockstep, seconds; the tick then counts as unanswered.
@@ -70,7 +72,7 @@ impl Default for WaitConfig {
     }
 }
 
-/// Link that sensor frames cross on their way to the agents. Nothing set: none.
+/// Link emulation for sensor frames on their way to the agents. Nothing set: none.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema, clap::Args)]
 #[serde(default, deny_unknown_fields)]
 #[command(next_help_heading = "Link from sensors to agents")]
@@ -78,13 +80,13 @@ pub struct SensorLinkConfig {
     /// Mean delay, milliseconds.
     #[arg(long, value_name = "MS")]
     pub latency_ms: Option<f64>,
-    /// Standard deviation of the delay, milliseconds; the order of frames stays. Needs `latency_ms`.
+    /// Standard deviation of the delay, milliseconds; the order of frames is kept. Needs `latency_ms`.
     #[arg(long, value_name = "MS")]
     pub jitter_ms: Option<f64>,
     /// Rate of each vehicle's link, Mbit/s.
     #[arg(long, value_name = "MBPS")]
     pub bandwidth_mbps: Option<f64>,
-    /// Share of the frames that get lost, 0 to 1.
+    /// Share of the frames that is lost, 0 to 1.
     #[arg(long, value_name = "SHARE")]
     pub loss: Option<f64>,
     /// Same seed, same delays and losses.
@@ -93,7 +95,7 @@ pub struct SensorLinkConfig {
 }
 
 impl SensorLinkConfig {
-    /// The stages of the link; `None` where nothing is set.
+    /// The stages of the link; `None` if nothing is set.
     #[must_use]
     pub fn stages(&self) -> Option<LinkConfig> {
         let Self { latency_ms, jitter_ms, bandwidth_mbps, loss, .. } = *self;
@@ -136,7 +138,7 @@ impl ProcessConfig for ReplayConfig {
 }
 
 impl ReplayConfig {
-    /// The same as the replay takes it.
+    /// The options of the replay.
     #[must_use]
     pub fn options(&self) -> StreamOptions {
         let Self { scene, wait, .. } = self;

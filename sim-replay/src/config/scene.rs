@@ -1,4 +1,4 @@
-//! The recorded scene that a run plays, and how it is played.
+//! Recorded scene of a run, and options of its replay.
 
 use std::path::PathBuf;
 
@@ -9,12 +9,12 @@ use serde::{Deserialize, Serialize};
 
 use dataset::IntensityScale;
 
-/// The recorded scene that a run plays, and how it is played.
+/// Recorded scene of a run, and options of its replay.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema, clap::Args)]
 #[serde(deny_unknown_fields)]
 #[command(next_help_heading = "Scene")]
 pub struct SceneConfig {
-    /// Data set, split or scenario; the layout is found out.
+    /// Data set, split or scenario; the layout is detected.
     #[arg(required_unless_present = "config")]
     pub dir: PathBuf,
     /// Scenario of the data set. Absent: the first.
@@ -25,7 +25,7 @@ pub struct SceneConfig {
     #[arg(long, value_name = "IDS", value_delimiter = ',', allow_hyphen_values = true)]
     #[serde(default)]
     pub agents: Vec<CavId>,
-    /// Variant of the sweeps, where the data set has several (weather), for example fog_0.060. Absent: the plain ones.
+    /// Variant of the sweeps, if the data set has several (weather), for example fog_0.060. Absent: the plain ones.
     #[arg(long)]
     #[serde(default)]
     pub variant: Option<String>,
@@ -37,7 +37,7 @@ pub struct SceneConfig {
     #[arg(long)]
     #[serde(default)]
     pub radar: bool,
-    /// Seconds of the scene per second; 0: as fast as the bus takes it, dropping nothing.
+    /// Seconds of the scene per second; 0: as fast as the subscribers accept it, without drops.
     #[arg(long, value_name = "TIMES")]
     #[serde(default = "SceneConfig::recorded_rate")]
     pub rate: f64,
@@ -53,7 +53,7 @@ pub struct SceneConfig {
     #[arg(id = "loop", long = "loop")]
     #[serde(default, rename = "loop")]
     pub repeat: bool,
-    /// Publish a tick only when the egos have answered the one before: slow, but nothing is ever late.
+    /// Publish a tick only when the egos have answered the previous one: slow, but no message is late.
     #[arg(long)]
     #[serde(default)]
     pub lockstep: bool,
@@ -67,7 +67,7 @@ impl SceneConfig {
     /// Checks the values.
     ///
     /// # Errors
-    /// [`FieldError`] for the first that is not allowed.
+    /// [`FieldError`] for the first invalid value.
     pub fn validate(&self) -> Result<(), FieldError> {
         within("scene.rate", self.rate, 0.0, 1e6)?;
         within("scene.frames", self.frames.unwrap_or(1), 1, usize::MAX)

@@ -1,14 +1,14 @@
-//! Doubts about annotated boxes as a whole: right numbers in wrong frames or units are sound one by one.
+//! Plausibility of annotated boxes as a whole: boxes in wrong frames or units can be valid one by one.
 
 use super::{AgentReport, Problem};
 
-/// Boxes of an agent from which on shares mean something.
+/// Least number of boxes of an agent for which shares are evaluated.
 const ENOUGH_BOXES: usize = 20;
 /// Largest share of boxes without any of the agent's own points, of those in frames with points.
 const MAX_EMPTY_SHARE: f64 = 0.5;
 const HINT: &str = "frames (axes, order of the pose's numbers) or units of the boxes may be wrong";
 
-/// The finding that agents list `targets` objects of the classes that count, and none is ground truth of any ego.
+/// The finding that agents list `targets` objects of the protocol's classes, and none is ground truth of any ego.
 pub(super) fn without_ground_truth(scenario: &str, targets: usize, merged: usize) -> Option<Problem> {
     let reason =
         format!("ground truth 0 for every ego and tick, though agents list {targets} objects of its classes: {HINT}");

@@ -1,18 +1,18 @@
-//! Points of a sweep by square cells, so that a box looks at those near it alone.
+//! Grid index over the points of a sweep: a box tests only the points near it.
 
 use nalgebra::{Isometry3, Point3};
 use protocol::PointCloud;
 
 /// Width of a cell, metres: about that of a car.
 const CELL_M: f32 = 4.0;
-/// Cells on each side of the sensor; what lies beyond is in the outermost.
+/// Cells on each side of the sensor; points beyond are in the outermost.
 const CELLS: usize = 40;
 const ACROSS: usize = 2 * CELLS;
 
 /// The points of a sweep, sorted by cell.
 pub(super) struct Cells {
     points: Vec<[f32; 3]>,
-    /// Where the points of each cell begin, and the end of the last.
+    /// Start of the points of each cell, and the end of the last.
     begins: Vec<usize>,
 }
 
@@ -35,9 +35,9 @@ impl Cells {
         Self { points, begins }
     }
 
-    /// Whether a box holds a point: half its sizes, and how the frame of the points lies in its own.
+    /// True if a box contains a point; arguments are its transform from the LiDAR frame and its half sizes.
     pub(super) fn holds_point(&self, box_from_lidar: &Isometry3<f32>, half: [f32; 3]) -> bool {
-        // A little more than the box, for what rounding does.
+        // Slightly larger than the box, to allow for rounding.
         let radius = 1.0 + half.iter().map(|half| half * half).sum::<f32>().sqrt();
         let center = box_from_lidar.inverse().translation.vector;
         let columns = index(center.x - radius)..=index(center.x + radius);
@@ -56,7 +56,7 @@ fn cell_of(&[x, y, ..]: &[f32; 4]) -> usize {
     index(y) * ACROSS + index(x)
 }
 
-/// The column or row of a coordinate. Not a number is 0.
+/// The column or row of a coordinate. NaN is 0.
 fn index(metres: f32) -> usize {
     let cell = (metres / CELL_M + CELLS as f32).clamp(0.0, (ACROSS - 1) as f32);
     cell as usize
@@ -70,7 +70,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn cells_find_what_a_look_at_all_points_finds(
+        fn cells_find_the_same_as_a_scan_of_all_points(
             points in prop::collection::vec(prop::array::uniform4(-200.0..200.0f32), 0..60),
             center in prop::array::uniform3(-200.0..200.0f32),
             yaw in -3.2..3.2f32,

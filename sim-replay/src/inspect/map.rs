@@ -1,4 +1,4 @@
-//! Findings of an OpenDRIVE map: what it holds, and what of it is not built as its file gives it.
+//! Report on an OpenDRIVE map: its contents, and parts that are not built as its file gives them.
 
 use std::fmt;
 use std::path::Path;
@@ -7,16 +7,16 @@ use serde::Serialize;
 
 use simulator::map::{Finding, Map, TownError, read_map};
 
-/// What an OpenDRIVE map holds. Serializes to the JSON of `sim-replay inspect --json MAP.xodr`, prints as its table.
+/// Contents of an OpenDRIVE map. Serializes to the JSON of `sim-replay inspect --json MAP.xodr`, prints as its table.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct MapReport {
-    /// The file, as it was given.
+    /// The file, as given.
     pub path: String,
     /// Roads that can be built.
     pub roads: usize,
-    /// Their length together, metres.
+    /// Total length, metres.
     pub roads_m: f64,
-    /// Roads on which traffic keeps left; on the others it keeps right.
+    /// Roads with left-hand traffic; the others have right-hand traffic.
     pub left_hand_roads: usize,
     /// Roads that are not level across: superelevation, crossfall, shape.
     pub banked_roads: usize,
@@ -26,11 +26,11 @@ pub struct MapReport {
     pub direct_junctions: usize,
     /// Driving lanes; a road has one for each of its lanes and lane sections.
     pub lanes: usize,
-    /// Their length together, metres.
+    /// Total length, metres.
     pub lanes_m: f64,
-    /// Driving lanes on which no other follows.
+    /// Driving lanes without a successor.
     pub dead_ends: usize,
-    /// Lowest and highest place of the driving lanes' middles, metres; `None` without driving lanes.
+    /// Lowest and highest point of the driving lanes' centre lines, metres; `None` without driving lanes.
     pub heights_m: Option<[f64; 2]>,
     /// Parts that are not built as the file gives them.
     pub findings: Vec<Finding>,
@@ -39,7 +39,7 @@ pub struct MapReport {
 /// Reads an OpenDRIVE map.
 ///
 /// # Errors
-/// [`TownError`] where the file cannot be read or is no usable map.
+/// [`TownError`] if the file cannot be read or is no usable map.
 pub fn inspect_map(path: &Path) -> Result<MapReport, TownError> {
     let Map { network, lanes } = read_map(path)?;
     let roads = &network.roads;

@@ -1,6 +1,7 @@
-//! What a dataset holds, and everything that is wrong with it.
+//! Inspection of a data set: contents and problems.
 //!
-//! Every frame is read. What cannot be read becomes a [`Problem`] with file, line and field, and the rest goes on.
+//! Every frame is read. A frame that cannot be read becomes a [`Problem`] with file, line and field, and reading
+//! continues.
 
 mod boxes;
 mod cells;
@@ -23,17 +24,17 @@ use dataset::{Layout, MissingFrame};
 /// The findings. Serializes to the JSON of `sim-replay inspect --json`, prints as its table.
 #[derive(Debug, Clone, Serialize)]
 pub struct Report {
-    /// The folder, as it was given.
+    /// The folder, as given.
     pub path: String,
-    /// Its layout, where it has one that is known.
+    /// Its layout, if it is a supported one.
     pub layout: Option<Layout>,
-    /// The protocol that ground truth was merged by: the one of the layout, unless another was asked for.
+    /// The protocol by which ground truth was merged: that of the layout, unless another was requested.
     pub protocol: Option<EvaluationProtocol>,
-    /// What was found in each scenario.
+    /// Findings of each scenario.
     pub scenarios: Vec<ScenarioReport>,
-    /// Merged ground truth by tick, ego and set of agents: the ego alone, and with all in range.
+    /// Merged ground truth by tick, ego and set of agents: ego-only, and with all agents in range.
     pub ticks: Vec<TickReport>,
-    /// What is wrong.
+    /// Faults of the data set.
     pub problems: Vec<Problem>,
 }
 
@@ -44,11 +45,11 @@ pub struct ScenarioReport {
     pub name: String,
     /// Its layout.
     pub layout: Layout,
-    /// Which way its axes turn on disk.
+    /// Handedness of its axes on disk.
     pub handedness: Handedness,
-    /// Moments of the ego.
+    /// Number of ticks of the ego.
     pub frames: usize,
-    /// From the first moment to the last, seconds.
+    /// Time from the first tick to the last, seconds.
     pub seconds: f64,
     /// Frames per second, by the median step; `None` for a single frame.
     pub rate_hz: Option<f64>,
@@ -56,7 +57,7 @@ pub struct ScenarioReport {
     pub agents: Vec<AgentReport>,
     /// Variants of the LiDAR sweep.
     pub lidar_variants: Vec<String>,
-    /// Whether there are radar points.
+    /// True if there are radar points.
     pub has_radar: bool,
     /// Frames that some agents have and others lack.
     pub missing: Vec<MissingFrame>,
@@ -65,13 +66,13 @@ pub struct ScenarioReport {
 /// An agent of a scenario.
 #[derive(Debug, Clone, Serialize)]
 pub struct AgentReport {
-    /// Who.
+    /// Id of the agent.
     pub id: CavId,
-    /// Moments at which it has a sweep that can be read.
+    /// Ticks at which it has a readable sweep.
     pub frames: usize,
     /// Points of a sweep.
     pub points: Option<Summary>,
-    /// Form and intensities of its sweeps; `None` where none has a point.
+    /// Form and intensities of its sweeps; `None` if none has a point.
     pub sweeps: Option<SweepReport>,
     /// Points left out because a number is not finite, over all sweeps. Organised clouds have many.
     pub dropped_points: usize,
@@ -81,7 +82,7 @@ pub struct AgentReport {
     pub boxes: Option<Summary>,
     /// Boxes that hold none of the agent's own points, over all frames. Many of them hint at wrong axes.
     pub boxes_without_points: usize,
-    /// How far the LiDAR moved, metres, over all frames with a pose; `None` without poses.
+    /// Path length of the LiDAR, metres, over all frames with a pose; `None` without poses.
     pub distance_m: Option<f64>,
 }
 
@@ -97,7 +98,7 @@ pub struct Summary {
 }
 
 impl Summary {
-    /// Of counts, one per frame; `None` where there is none.
+    /// Summary of counts, one per frame; `None` if there is none.
     #[must_use]
     pub fn of(counts: &[usize]) -> Option<Self> {
         let (min, max) = (*counts.iter().min()?, *counts.iter().max()?);
@@ -112,10 +113,10 @@ pub struct TickReport {
     pub scenario: String,
     /// Stem of the tick.
     pub tick: String,
-    /// In whose LiDAR frame and range.
+    /// Agent whose LiDAR frame and range apply.
     pub ego: CavId,
-    /// Whose annotations were merged, the ego first.
+    /// Agents whose annotations were merged, the ego first.
     pub agents: Vec<CavId>,
-    /// How many objects there are.
+    /// Number of objects.
     pub merged_boxes: usize,
 }

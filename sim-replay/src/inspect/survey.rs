@@ -1,4 +1,4 @@
-//! Reading everything and counting.
+//! Survey: reads all frames of a data set and counts.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -17,10 +17,10 @@ use dataset::ground_truth::{self, GroundTruthRule};
 use dataset::pcd::{PcdCloud, Place};
 use dataset::{self, OpenOptions, ReadError, Scenario};
 
-/// Largest share of points that are not finite: with more of them a sweep is lost, not full of gaps.
+/// Largest share of points that are not finite: with more of them a sweep is faulty, not merely sparse.
 const MOST_DROPPED: f64 = 0.9;
 
-/// What was found in one agent's frame.
+/// Findings of one agent's frame.
 #[derive(Debug, Default)]
 struct FrameFindings {
     points: Option<usize>,
@@ -35,7 +35,7 @@ struct FrameFindings {
     problems: Vec<Problem>,
 }
 
-/// What was found at one tick.
+/// Findings of one tick.
 #[derive(Debug)]
 struct TickFindings {
     agents: Vec<FrameFindings>,
@@ -44,8 +44,8 @@ struct TickFindings {
     merged: Vec<TickReport>,
 }
 
-/// Reads all of the data set in `dir`, its ground truth by the protocol. `progress` is told how many ticks are done and how
-/// many there are.
+/// Reads all of the data set in `dir`, its ground truth by the protocol. `progress` receives the number of completed
+/// ticks and their total.
 #[must_use]
 pub fn inspect(
     dir: &Path,
@@ -102,7 +102,8 @@ pub fn inspect(
     report
 }
 
-/// Each problem once, with how often it was found: several frames may need one file, or have objects of one unknown type.
+/// Each problem once, with its number of occurrences: several frames may need one file, or have objects of one unknown
+/// type.
 fn counted(problems: Vec<Problem>) -> Vec<Problem> {
     let mut counts: BTreeMap<Problem, usize> = BTreeMap::new();
     for problem in problems {
@@ -115,7 +116,7 @@ fn counted(problems: Vec<Problem>) -> Vec<Problem> {
     counts.into_iter().map(with_count).collect()
 }
 
-/// Doubts about the boxes of a scenario as a whole.
+/// Problems of the boxes of a scenario as a whole.
 fn box_problems(scenario: &ScenarioReport, findings: &[TickFindings]) -> Vec<Problem> {
     let targets = findings.iter().map(|tick| tick.targets).sum();
     let merged = findings.iter().flat_map(|tick| &tick.merged).map(|tick| tick.merged_boxes).sum();
@@ -189,7 +190,7 @@ fn survey_points(
             return None;
         }
     };
-    // Organised clouds have a point for every ray, also where it met nothing.
+    // Organised clouds have a point for every ray, including rays without a hit.
     if cloud.dropped as f64 > MOST_DROPPED * (cloud.dropped + cloud.points.len()) as f64 {
         let path = scenario.points_path(agent, tick, variant).unwrap_or_default();
         findings.problems.push(not_finite(&path, &cloud));
@@ -220,7 +221,7 @@ fn holds_point(world_from_lidar: Option<&Pose>, object: &Object, cells: &Cells) 
     cells.holds_point(&object_from_lidar.cast::<f32>(), object.size_m.map(|size| (size / 2.0) as f32))
 }
 
-/// What is wrong with the sweeps of each agent as a whole.
+/// Problems of the sweeps of each agent as a whole.
 fn sweep_problems(scenario: &Scenario, findings: &[TickFindings], options: &OpenOptions) -> Vec<Problem> {
     let of_agent = |agent: usize| {
         let sweeps = sweeps_of(findings, agent);
@@ -236,7 +237,7 @@ fn sweeps_of(findings: &[TickFindings], agent: usize) -> Vec<&SweepFindings> {
     findings.iter().filter_map(|tick| tick.agents[agent].sweep.as_ref()).collect()
 }
 
-/// One entry for every ego alone, and one with all in range of it, where there is anyone.
+/// One ego-only entry for every ego, and one with all agents in range, if there are any.
 fn merged_counts(scenario: &Scenario, tick: usize, frames: &[&Frame], rule: &GroundTruthRule) -> Vec<TickReport> {
     let report = |ego: &CavId, agents: Vec<CavId>, merged_boxes: usize| TickReport {
         scenario: scenario.name.clone(),
@@ -348,11 +349,11 @@ mod tests {
         assert_eq!(agent.points, Some(Summary { min: 1, mean: 2.0, max: 3 }));
         assert_eq!(agent.boxes_without_points, 1, "the second sweep has no point in the box");
         assert_eq!(agent.distance_m, Some(0.0));
-        assert!(report.to_string().contains("ground truth of ego 1: 1 alone"), "{report}");
+        assert!(report.to_string().contains("ground truth of ego 1: 1 ego-only"), "{report}");
     }
 
     #[test]
-    fn all_that_is_wrong_is_said_and_the_rest_is_counted() {
+    fn every_fault_is_reported_and_the_rest_is_counted() {
         let dir = tempfile::tempdir().unwrap();
         let root = dir.path();
         let whole = sweep(&[[10.0, 0.0, -1.3, 0.25], [1.0, 2.0, 3.0, 0.5]]);
@@ -397,15 +398,15 @@ mod tests {
     }
 
     #[test]
-    fn intensities_are_told_and_what_is_wrong_with_them_is_a_problem() {
+    fn intensities_are_reported_and_their_faults_are_problems() {
         let (messages, table) = of_intensities(&[&[0.0, 0.25, 1.0], &[0.5]]);
         assert!(messages.is_empty(), "{messages:?}");
-        let line = "  sweeps of 1: PCD, ascii; intensity from intensity, divided by 1: 0.000 to 1.000, median 0.500";
+        let line = "  sweeps of 1: PCD, ascii; intensity from intensity, divided by 1: 0.000 to 1.000, median 0.375";
         assert!(table.contains(line), "{table}");
         let (messages, table) = of_intensities(&[&[0.0, 51.0, 255.0]]);
         assert!(messages.is_empty() && table.contains("divided by 255: 0.000 to 1.000, median 0.200"), "{table}");
         let message = |sweeps: &[&[f32]]| of_intensities(sweeps).0.concat();
-        assert_eq!(message(&[&[0.5; 19]]), "", "few points tell nothing");
+        assert_eq!(message(&[&[0.5; 19]]), "", "few points are not evaluated");
         assert_eq!(
             message(&[&[0.5; 19], &[0.5]]),
             "/1: sweeps of agent 1: all 20 intensities are 0.5 (field intensity divided by 1), expected a sensor's, which \
@@ -434,7 +435,7 @@ mod tests {
         assert_eq!(
             messages,
             [
-                "/1: sweeps of agent 1: no field of intensity (intensity, reflectivity, remission, rgb, ...): it is 0 for \
+                "/1: sweeps of agent 1: no intensity field (intensity, reflectivity, remission, rgb, ...): it is 0 for \
                  all points",
                 "/1: sweeps of agent 1: 50.0 % of the points lie within 300 m, usual are 95.0 % or more",
             ]
@@ -474,7 +475,7 @@ mod tests {
         assert_eq!(
             messages,
             [
-                ": type: the text \"Ufo\" is no known type of object: it counts as other, not as a vehicle (2 times)",
+                ": type: the text \"Ufo\" is an unknown type of object: it counts as other, not as a vehicle (2 times)",
                 "/1/000010.yaml:4: vehicles.8.angle: missing: the object is left out",
                 "/1/000012.yaml:4: vehicles.8.angle: missing: the object is left out",
             ]
@@ -483,11 +484,11 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_dataset_is_a_problem() {
+    fn a_folder_that_is_no_data_set_is_a_problem() {
         let dir = tempfile::tempdir().unwrap();
         let (report, messages) = survey(dir.path());
         assert_eq!(report.layout, None);
-        assert!(messages[0].contains("no known layout"), "{messages:?}");
+        assert!(messages[0].contains("no supported layout"), "{messages:?}");
         assert!(report.to_string().contains("1 problem:"));
     }
 }

@@ -1,4 +1,4 @@
-//! Sweeps of an agent: how they are stored, where their intensities come from, and whether both make sense.
+//! Sweeps of an agent: form, source of intensities, and plausibility of both.
 
 use std::path::Path;
 
@@ -10,7 +10,7 @@ use dataset::pcd::{IntensityKind, IntensityOrigin, PcdCloud};
 use dataset::{IntensityScale, Plausibility};
 use support::statistics;
 
-/// Points of a sweep that its median is taken of at most.
+/// Largest number of points of a sweep used for its median.
 const MEDIAN_OF: usize = 4096;
 /// Fewer points than this may all have the same intensity.
 const LEAST_POINTS: usize = 20;
@@ -22,7 +22,7 @@ const USUAL_DIVISORS: [f32; 2] = [1.0, 255.0];
 pub struct SweepReport {
     /// Form of the files, for example `PCD, binary` or `5 floats per point: x y z intensity ring`.
     pub form: &'static str,
-    /// Where intensities come from; `None` where there are none.
+    /// Source of intensities; `None` if there are none.
     pub intensity: Option<IntensityOrigin>,
     /// Smallest intensity, after division.
     pub min_intensity: f32,
@@ -32,7 +32,7 @@ pub struct SweepReport {
     pub max_intensity: f32,
 }
 
-/// What was found in one sweep.
+/// Findings of one sweep.
 #[derive(Debug, Default)]
 pub(super) struct SweepFindings {
     points: usize,
@@ -71,7 +71,7 @@ fn median(values: &[f32]) -> Option<f32> {
     statistics::median(&values).map(|median| median as f32)
 }
 
-/// The sweeps of an agent together, in order; `None` where no sweep has a point.
+/// The sweeps of an agent together, in order; `None` if no sweep has a point.
 pub(super) fn summarize(sweeps: &[&SweepFindings]) -> Option<SweepReport> {
     let first = sweeps.iter().find(|sweep| sweep.range.is_some())?;
     let ranges = || sweeps.iter().filter_map(|sweep| sweep.range);
@@ -84,7 +84,7 @@ pub(super) fn summarize(sweeps: &[&SweepFindings]) -> Option<SweepReport> {
     })
 }
 
-/// What is wrong with the sweeps of an agent, which lie in `folder`.
+/// Problems of the sweeps of an agent in `folder`.
 pub(super) fn problems(folder: &Path, agent: &CavId, sweeps: &[&SweepFindings], scale: IntensityScale) -> Vec<Problem> {
     let Some(report) = summarize(sweeps) else { return Vec::new() };
     let mut plausibility = Plausibility::default();
@@ -104,11 +104,11 @@ pub(super) fn problems(folder: &Path, agent: &CavId, sweeps: &[&SweepFindings], 
     problems
 }
 
-/// The first thing that is wrong with the intensities.
+/// The first fault of the intensities.
 fn intensity_fault(report: &SweepReport, sweeps: &[&SweepFindings], scale: IntensityScale) -> Option<String> {
     let Some(origin) = &report.intensity else {
         return Some(
-            "no field of intensity (intensity, reflectivity, remission, rgb, ...): it is 0 for all points".into(),
+            "no intensity field (intensity, reflectivity, remission, rgb, ...): it is 0 for all points".into(),
         );
     };
     let SweepReport { min_intensity: min, max_intensity: max, .. } = *report;

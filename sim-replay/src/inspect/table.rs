@@ -1,4 +1,4 @@
-//! The findings for human eyes.
+//! Text table of the findings.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -9,12 +9,12 @@ use super::{AgentReport, Report, ScenarioReport, Summary, TickReport};
 use dataset::Layout;
 use support::text_table::{Side, TextTable};
 
-/// Problems that are printed before the rest is only counted.
+/// Problems that are printed; further ones are counted.
 const MAX_PROBLEMS: usize = 50;
 
 impl fmt::Display for Report {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let layout = self.layout.map_or("no known layout", Layout::name);
+        let layout = self.layout.map_or("no supported layout", Layout::name);
         let frames: usize = self.scenarios.iter().map(|scenario| scenario.frames).sum();
         writeln!(
             f,
@@ -67,7 +67,7 @@ impl Report {
         self.write_merged(f, scenario)
     }
 
-    /// A line per ego: boxes alone, and with the others.
+    /// One line per ego: boxes ego-only, and with the other agents.
     fn write_merged(&self, f: &mut fmt::Formatter<'_>, scenario: &ScenarioReport) -> fmt::Result {
         let of_scenario = self.ticks.iter().filter(|tick| tick.scenario == scenario.name);
         let mut by_ego: BTreeMap<&str, (Vec<usize>, Vec<usize>)> = BTreeMap::new();
@@ -80,13 +80,13 @@ impl Report {
                 Some(summary) => format!(", {} with those in range", shown(Some(summary))),
                 None => String::new(),
             };
-            writeln!(f, "  ground truth of ego {ego}: {} alone{with_others}", shown(Summary::of(&alone)))?;
+            writeln!(f, "  ground truth of ego {ego}: {} ego-only{with_others}", shown(Summary::of(&alone)))?;
         }
         Ok(())
     }
 }
 
-/// A line for every agent that lacks frames which others have; at those that the ego lacks there is no tick.
+/// One line for every agent that lacks frames which others have; at those that the ego lacks there is no tick.
 fn write_missing(f: &mut fmt::Formatter<'_>, scenario: &ScenarioReport) -> fmt::Result {
     for (index, AgentReport { id, .. }) in scenario.agents.iter().enumerate() {
         let lacking: Vec<_> = scenario.missing.iter().filter(|frame| frame.agent == *id).collect();
@@ -115,7 +115,7 @@ fn agents_table(agents: &[AgentReport]) -> TextTable {
     table
 }
 
-/// The mean, and the span where there is one.
+/// The mean, and the range if there is one.
 fn shown(summary: Option<Summary>) -> String {
     match summary {
         None => "-".into(),

@@ -1,4 +1,4 @@
-//! How far a replay is, in a file: one that falls is started again and goes on from there.
+//! Checkpoint of a replay in a file: a restarted replay resumes from there.
 
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
@@ -13,32 +13,32 @@ use bus::bounded_queue::{BoundedQueue, Pop, PushOutcome};
 use support::atomic_file;
 use support::bounded_file;
 
-/// Largest file that is read: a place has a few numbers.
+/// Largest file that is read: a checkpoint is a few numbers.
 const MAX_BYTES: u64 = 64 << 10;
 
-/// How far a replay is.
+/// State of a replay.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Place {
     /// The scenario.
     pub scenario: String,
-    /// Where in it.
+    /// Position in the scenario.
     pub position: Position,
-    /// Whether the clock is halted.
+    /// True if the clock is halted.
     pub is_halted: bool,
-    /// Ticks published so far, by all lives.
+    /// Ticks published so far, by all process instances.
     pub ticks: u64,
-    /// Ticks that were not answered, by all lives.
+    /// Ticks that were not answered, by all process instances.
     pub unanswered: u64,
-    /// Frames that could not be read, by all lives.
+    /// Frames that could not be read, by all process instances.
     pub unreadable_frames: u64,
 }
 
 impl Place {
-    /// The place that an earlier life has left in a scenario of `ticks` ticks; `None`: there was no earlier life.
+    /// The state left by the previous process instance in a scenario of `ticks` ticks; `None` if there was none.
     ///
     /// # Errors
-    /// [`BookmarkError`] when the file is no place, or one of another scene.
+    /// [`BookmarkError`] if the file holds no state, or that of another scene.
     pub fn read(path: &Path, scenario: &str, ticks: usize) -> Result<Option<Self>, BookmarkError> {
         let at = || path.to_path_buf();
         let text = match bounded_file::read_text(path, MAX_BYTES) {
@@ -48,55 +48,55 @@ impl Place {
         };
         let place: Self = serde_json::from_str(&text).map_err(|source| BookmarkError::Text { path: at(), source })?;
         if place.scenario != scenario || place.position.next_tick > ticks {
-            let told = format!("is tick {} of scenario {}", place.position.next_tick, place.scenario);
-            return Err(BookmarkError::Elsewhere { path: at(), place: told, scenario: scenario.into(), ticks });
+            let position = format!("is tick {} of scenario {}", place.position.next_tick, place.scenario);
+            return Err(BookmarkError::Elsewhere { path: at(), place: position, scenario: scenario.into(), ticks });
         }
         Ok(Some(place))
     }
 
-    /// What earlier lives have to report.
+    /// Report of the previous process instances.
     pub(super) fn report(&self) -> StreamReport {
-        // A file may say anything; counting goes on from here.
+        // The file may hold any number; counting continues from here.
         let [ticks, unanswered, unreadable_frames] =
             [self.ticks, self.unanswered, self.unreadable_frames].map(|count| count.min(u64::MAX >> 1));
         StreamReport { ticks, unanswered, unreadable_frames, ..StreamReport::default() }
     }
 }
 
-/// Why a place cannot be read.
+/// Reasons why a checkpoint cannot be read.
 #[derive(Debug, thiserror::Error)]
 pub enum BookmarkError {
     /// The file cannot be read.
     #[error("{}: {source}", path.display())]
     Read {
-        /// Which.
+        /// The file.
         path: PathBuf,
-        /// Why.
+        /// Error of the operating system.
         source: std::io::Error,
     },
-    /// It is none.
-    #[error("{}: not the place of a replay: {source}", path.display())]
+    /// The file holds no checkpoint.
+    #[error("{}: not a replay checkpoint: {source}", path.display())]
     Text {
-        /// Which.
+        /// The file.
         path: PathBuf,
-        /// Why.
+        /// Error of the parser.
         source: serde_json::Error,
     },
-    /// It is one of another scene.
-    #[error("{}: the place {place}, but scenario {scenario} has {ticks} ticks: remove the file, or choose another", path.display())]
+    /// The checkpoint belongs to another scene.
+    #[error("{}: the checkpoint {place}, but scenario {scenario} has {ticks} ticks: remove the file, or choose another", path.display())]
     Elsewhere {
-        /// Which.
+        /// The file.
         path: PathBuf,
-        /// The place it tells.
+        /// Position in the file.
         place: String,
         /// The scenario that is played.
         scenario: String,
-        /// Its ticks.
+        /// Number of its ticks.
         ticks: usize,
     },
 }
 
-/// Writes places down, on a thread of its own: the clock does not wait for a disk.
+/// Writes checkpoints on its own thread: the clock does not wait for the disk.
 pub(super) struct Checkpoint {
     newest: Arc<BoundedQueue<(), Place>>,
     writing: Option<JoinHandle<()>>,
@@ -104,17 +104,17 @@ pub(super) struct Checkpoint {
 
 impl Checkpoint {
     /// # Errors
-    /// When the system gives no thread.
+    /// If the system provides no thread.
     pub(super) fn open(path: PathBuf) -> std::io::Result<Self> {
         let newest = Arc::new(BoundedQueue::new(1, 1));
-        let writing = thread::Builder::new().name("bookmark".into()).spawn({
+        let writing = thread::Builder::new().name("checkpoint".into()).spawn({
             let newest = Arc::clone(&newest);
             move || write_all(&path, &newest)
         })?;
         Ok(Self { newest, writing: Some(writing) })
     }
 
-    /// Has a place written down; one that still waits for the disk is out of date.
+    /// Queues a state for writing; one that still waits for the disk is replaced.
     pub(super) fn note(&self, place: Place) {
         match self.newest.push((), place) {
             PushOutcome::Queued | PushOutcome::Replaced(_) | PushOutcome::NoLane(_) | PushOutcome::Closed(_) => {}
@@ -126,20 +126,23 @@ impl Drop for Checkpoint {
     fn drop(&mut self) {
         self.newest.close();
         if self.writing.take().is_some_and(|writing| writing.join().is_err()) {
-            tracing::error!("the thread that notes the place panicked");
+            tracing::error!("the thread that writes checkpoints panicked");
         }
     }
 }
 
 fn write_all(path: &Path, places: &BoundedQueue<(), Place>) {
-    let mut has_complained = false;
+    let mut has_warned = false;
     while let Pop::Item((), place) = places.take(None) {
         match write(path, &place) {
-            Ok(()) => has_complained = false,
-            // Without it the replay goes on; only a next life cannot.
-            Err(error) if !has_complained => {
-                tracing::warn!("{}: {error}; a replay that falls now begins where this file stands", path.display());
-                has_complained = true;
+            Ok(()) => has_warned = false,
+            // Without a checkpoint the replay continues, but it cannot be resumed.
+            Err(error) if !has_warned => {
+                tracing::warn!(
+                    "{}: {error}; a replay restarted now resumes from the last checkpoint written",
+                    path.display()
+                );
+                has_warned = true;
             }
             Err(_) => {}
         }
@@ -168,15 +171,15 @@ mod tests {
     }
 
     #[test]
-    fn the_last_place_comes_back() {
+    fn the_last_checkpoint_is_read_back() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("place.json");
         assert_eq!(Place::read(&path, "town1", 10).unwrap(), None);
-        let bookmark = Checkpoint::open(path.clone()).unwrap();
+        let checkpoint = Checkpoint::open(path.clone()).unwrap();
         for ticks in 0..=7 {
-            bookmark.note(Place { ticks, ..place() });
+            checkpoint.note(Place { ticks, ..place() });
         }
-        drop(bookmark);
+        drop(checkpoint);
         assert_eq!(Place::read(&path, "town1", 10).unwrap(), Some(place()));
         assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 1, "nothing is left beside it");
         let report = place().report();
@@ -184,28 +187,28 @@ mod tests {
     }
 
     #[test]
-    fn a_place_of_another_scene_and_a_broken_one_are_named() {
+    fn a_checkpoint_of_another_scene_and_a_broken_one_are_reported() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("place.json");
         write(&path, &place()).unwrap();
-        let told = |found: Result<Option<Place>, BookmarkError>| found.unwrap_err().to_string();
+        let error_of = |found: Result<Option<Place>, BookmarkError>| found.unwrap_err().to_string();
         for (scenario, ticks) in [("town4", 10), ("town1", 6)] {
-            let error = told(Place::read(&path, scenario, ticks));
+            let error = error_of(Place::read(&path, scenario, ticks));
             assert!(error.contains("tick 7 of scenario town1") && error.contains(scenario), "{error}");
         }
         for broken in ["{", "[]", "{\"scenario\": \"town1\"}"] {
             fs::write(&path, broken).unwrap();
-            assert!(told(Place::read(&path, "town1", 10)).contains("not the place of a replay"));
+            assert!(error_of(Place::read(&path, "town1", 10)).contains("not a replay checkpoint"));
         }
         fs::write(&path, " ".repeat(MAX_BYTES as usize + 1)).unwrap();
-        assert!(told(Place::read(&path, "town1", 10)).contains("larger than"));
+        assert!(error_of(Place::read(&path, "town1", 10)).contains("larger than"));
     }
 
     #[test]
     fn a_file_that_cannot_be_written_ends_nothing() {
-        let bookmark = Checkpoint::open(PathBuf::from("/nowhere/place.json")).unwrap();
-        bookmark.note(place());
-        drop(bookmark);
+        let checkpoint = Checkpoint::open(PathBuf::from("/nowhere/place.json")).unwrap();
+        checkpoint.note(place());
+        drop(checkpoint);
         assert!(Place::read(Path::new("/nowhere/place.json"), "town1", 10).unwrap().is_none());
     }
 }

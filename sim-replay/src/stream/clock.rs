@@ -1,17 +1,18 @@
-//! When the next tick is due on the wall.
+//! Replay clock: wall-clock time at which the next tick is due.
 
 use std::time::{Duration, Instant};
 
-/// Slower than this, as good as halted, no scene is played: the time to the next tick has to be one that a clock can hold.
+/// Slowest rate, close to a halt: the time to the next tick must be representable.
 const SLOWEST: f64 = 1e-6;
 
-/// The scene's clock on the wall: running at a rate, or halted, perhaps with some ticks still to go.
+/// Mapping from scene time to the wall clock: running at a rate, or halted, possibly with some ticks still to be
+/// published.
 #[derive(Debug, Clone)]
 pub struct ReplayClock {
-    /// Seconds of the scene per second of the wall; 0: every tick is due at once.
+    /// Seconds of the scene per second of the wall clock; 0: every tick is due at once.
     rate: f64,
     state: State,
-    // The moment at which a capture time was due; all others follow from it. None: the next tick is due at once.
+    // Wall-clock time at which a capture time was due; all others follow from it. `None`: the next tick is due at once.
     anchor: Option<(Instant, u64)>,
 }
 
@@ -28,7 +29,7 @@ impl ReplayClock {
         Self { rate, state: State::Running, anchor: None }
     }
 
-    /// RunScope on from here, at another rate where one is given.
+    /// Runs on from here, at another rate if one is given.
     pub fn resume(&mut self, rate: Option<f64>) {
         self.rate = rate.unwrap_or(self.rate);
         self.state = State::Running;
@@ -40,12 +41,12 @@ impl ReplayClock {
         self.state = State::Halted { steps: 0 };
     }
 
-    /// Whether it is halted, with nothing more to let through.
+    /// True if it is halted, with no further ticks to be published.
     pub(super) fn is_halted(&self) -> bool {
         self.state == State::Halted { steps: 0 }
     }
 
-    /// Halts, but lets `ticks` more through, each at once.
+    /// Halts, but allows `ticks` more, each at once.
     pub fn step(&mut self, ticks: u64) {
         let steps = match self.state {
             State::Halted { steps } => steps,
@@ -54,12 +55,12 @@ impl ReplayClock {
         self.state = State::Halted { steps: steps.saturating_add(ticks) };
     }
 
-    /// The scene's time has jumped, or the scene has been waited for: the next tick is due at once.
+    /// After a jump of the scene's time, or a wait: the next tick is due at once.
     pub fn rebase(&mut self) {
         self.anchor = None;
     }
 
-    /// When the tick captured at `capture_nanos` is due; `None` while the clock is halted.
+    /// Time at which the tick captured at `capture_nanos` is due; `None` while the clock is halted.
     #[must_use]
     pub fn due(&self, capture_nanos: u64, now: Instant) -> Option<Instant> {
         match (self.state, self.anchor) {
@@ -72,8 +73,8 @@ impl ReplayClock {
         }
     }
 
-    /// The tick captured at `capture_nanos`, which was due at `due`, is out. Counting from when it was due and not from
-    /// now keeps the pace: a late tick does not delay those after it.
+    /// Records that the tick captured at `capture_nanos`, which was due at `due`, was published. Counting from the due
+    /// time and not from now keeps the pace: a late tick does not delay those after it.
     pub fn published(&mut self, capture_nanos: u64, due: Instant) {
         match &mut self.state {
             State::Running => self.anchor = Some((due, capture_nanos)),

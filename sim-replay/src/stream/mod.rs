@@ -1,11 +1,11 @@
-//! A scene as live traffic: every vehicle's sensors on the bus, at the pace they were recorded at or another.
+//! Replay of a scene as live traffic: every vehicle's sensors on the bus, at the recorded pace or another.
 //!
-//! - [`Schedule`]: which tick comes next, and its time on the replay's clock.
-//! - [`ReplayClock`]: when that is on the wall; pause, step, rate.
-//! - [`ReadAhead`]: the next ticks are read while the current one is waited for.
-//! - [`AirReport`]: what became of frames that cross an emulated link on their way.
-//! - [`Place`]: how far it is, for one that falls and is started again.
-//! - [`Replay`]: the loop over them, steered over `control/*`.
+//! - [`Schedule`]: order of the ticks, and their time on the replay's clock.
+//! - [`ReplayClock`]: wall-clock time of a tick; pause, step, rate.
+//! - [`ReadAhead`]: reads the next ticks during the wait for the current one.
+//! - [`AirReport`]: counters of frames on an emulated link to the agents.
+//! - [`Place`]: state of the replay, from which a restarted one resumes.
+//! - [`Replay`]: the main loop, controlled over `control/*`.
 
 mod checkpoint;
 mod clock;

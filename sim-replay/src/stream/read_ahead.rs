@@ -1,4 +1,4 @@
-//! Reading the next ticks from disk while the current one is being waited for.
+//! Read-ahead: reads the next ticks from disk during the wait for the current one.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
@@ -8,7 +8,7 @@ use std::time::Duration;
 use dataset::frame::Frame;
 use dataset::{LoadOptions, ReadError, Scenario};
 
-/// The frames of one tick, one for each agent that was asked for, in that order.
+/// The frames of one tick, one for each requested agent, in that order.
 pub type TickFrames = Vec<Result<Frame, ReadError>>;
 
 #[derive(Default)]
@@ -24,7 +24,7 @@ impl State {
     }
 }
 
-/// A thread that reads the ticks it is told will be wanted, in order, and holds no more than those.
+/// A thread that reads the requested ticks, in order, and keeps no others.
 pub struct ReadAhead {
     shared: Arc<(Mutex<State>, Condvar)>,
     thread: Option<JoinHandle<()>>,
@@ -34,7 +34,7 @@ impl ReadAhead {
     /// Starts a thread that reads frames of `agents` (indices into the scenario's agents).
     ///
     /// # Errors
-    /// When the system gives no thread.
+    /// If the system provides no thread.
     pub fn start(scenario: Scenario, agents: Vec<usize>, options: LoadOptions) -> std::io::Result<Self> {
         let shared: Arc<(Mutex<State>, Condvar)> = Arc::default();
         let thread = thread::Builder::new().name("read ahead".into()).spawn({
@@ -43,7 +43,7 @@ impl ReadAhead {
                 while let Some(tick) = next_wanted(&shared) {
                     let frames = agents.iter().map(|&agent| scenario.load(agent, tick, &options)).collect();
                     let mut state = lock(&shared);
-                    // A jump may have made it unwanted in the meantime.
+                    // The tick may no longer be requested after a jump.
                     if state.wanted.contains(&tick) {
                         state.ready.insert(tick, frames);
                         shared.1.notify_all();
@@ -54,7 +54,7 @@ impl ReadAhead {
         Ok(Self { shared, thread: Some(thread) })
     }
 
-    /// Says which ticks will be taken next, in order; whatever else has been read is forgotten.
+    /// Sets the ticks that will be taken next, in order; other frames that were read are dropped.
     pub fn want(&self, ticks: &[usize]) {
         let mut state = lock(&self.shared);
         state.wanted = ticks.iter().copied().collect();
@@ -62,7 +62,7 @@ impl ReadAhead {
         self.shared.1.notify_all();
     }
 
-    /// The frames of a tick that is wanted, as soon as they are read; empty if the reading thread is gone.
+    /// The frames of a requested tick, as soon as they are read; empty if the reading thread has ended.
     #[must_use]
     pub fn take(&self, tick: usize) -> TickFrames {
         let mut state = lock(&self.shared);
@@ -77,7 +77,7 @@ impl ReadAhead {
                 state.wanted.push_front(tick);
                 self.shared.1.notify_all();
             }
-            // A thread that panics wakes nobody.
+            // A thread that panics does not notify the waiters.
             state = self.shared.1.wait_timeout(state, Duration::from_secs(1)).unwrap_or_else(PoisonError::into_inner).0;
         }
     }
@@ -88,7 +88,7 @@ impl Drop for ReadAhead {
         lock(&self.shared).is_closed = true;
         self.shared.1.notify_all();
         if let Some(thread) = self.thread.take() {
-            // A reader that panicked has already said so.
+            // A panic of the reader was already reported.
             let _ = thread.join();
         }
     }

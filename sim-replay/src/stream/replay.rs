@@ -1,4 +1,4 @@
-//! The loop that plays a scene.
+//! Main loop of a replay.
 
 use std::collections::BTreeSet;
 use std::path::PathBuf;
@@ -12,7 +12,7 @@ use super::checkpoint::{BookmarkError, Checkpoint, Place};
 use super::read_ahead::{ReadAhead, TickFrames};
 use super::report::StreamReport;
 use super::schedule::{Planned, Schedule};
-use super::sensor_link::{DelayedSweep, SensorAir};
+use super::sensor_link::{DelayedSweep, SensorLink};
 use super::sensor_publisher::{SensorPublisher, truth_of};
 use bus::bounded_queue::Pop;
 use bus::shutdown::Stop;
@@ -24,39 +24,39 @@ use link::{LinkConfig, LinkError};
 const READ_AHEAD: usize = 4;
 /// Commands that may wait.
 const COMMANDS: usize = 64;
-/// How long one that goes on where an earlier life was waits for the routes: the others have their own troubles, and the
-/// world does not wait for them.
+/// Longest time that a restarted replay waits for the routes: other processes may be down, and the scene does not wait
+/// for them.
 const RESUME_PATIENCE: Duration = Duration::from_secs(2);
 
-/// How to play a scene.
+/// Options of a replay.
 #[derive(Debug, Clone)]
 pub struct StreamOptions {
-    /// Vehicles that take part; all of the scenario where empty.
+    /// Vehicles that take part; if empty, all of the scenario.
     pub agents: Vec<CavId>,
-    /// Seconds of the scene per second; 0: as fast as the bus takes it, dropping nothing.
+    /// Seconds of the scene per second; 0: as fast as the subscribers accept it, without drops.
     pub rate: f64,
     /// Start again after the last tick.
     pub repeats: bool,
     /// First tick, counted from 0.
     pub seek: usize,
-    /// Ticks to play; `None`: to the end, or for ever.
+    /// Ticks to play; `None`: to the end, or without end.
     pub frames: Option<usize>,
-    /// What to read of each frame.
+    /// Options of reading a frame.
     pub load: LoadOptions,
-    /// Whether the vehicles' own agents are waited for: their `lidar` and `gnss` routes.
+    /// True to wait for the vehicles' own agents: their `lidar` and `gnss` routes.
     pub await_agents: bool,
-    /// Further routes that have to stand before the clock starts.
+    /// Further routes that must be up before the clock starts.
     pub expect: Vec<Route>,
-    /// How long to wait for the routes.
+    /// Longest time to wait for the routes.
     pub patience: Duration,
-    /// Egos whose detections of a tick are waited for before the next; none: the clock does not wait.
+    /// Egos whose detections of a tick are awaited before the next; empty: the clock does not wait.
     pub lockstep: Vec<CavId>,
-    /// How long to wait for an ego's detections before the tick is counted as unanswered.
+    /// Longest time to wait for an ego's detections; then the tick counts as unanswered.
     pub answer_patience: Duration,
-    /// A link that sensor frames cross on their way to the agents, and its seed; none: they arrive at once.
+    /// Link emulation between sensors and agents, and its seed; `None`: frames arrive at once.
     pub link: Option<(LinkConfig, u64)>,
-    /// Where to note after each tick how far the replay is, and to go on from where the file is there; the scene begins
-    /// elsewhere then than `seek` says.
+    /// Checkpoint file, written after each tick; if it exists, the replay resumes from it instead of starting at
+    /// `seek`.
     pub bookmark: Option<PathBuf>,
 }
 
@@ -81,13 +81,13 @@ impl Default for StreamOptions {
 }
 
 impl StreamOptions {
-    /// Whether those who listen set the pace: nothing is published that they have no room for.
+    /// True if the subscribers set the pace: nothing is published before they can accept it.
     fn is_paced(&self) -> bool {
         self.rate == 0.0 || !self.lockstep.is_empty()
     }
 }
 
-/// Why a scene cannot be played.
+/// Reasons why a scene cannot be played.
 #[derive(Debug, thiserror::Error)]
 pub enum StreamError {
     /// A vehicle that the scenario does not have.
@@ -95,9 +95,9 @@ pub enum StreamError {
     NoAgent {
         /// The scenario.
         scenario: String,
-        /// Who was asked for.
+        /// The requested agent.
         asked: CavId,
-        /// Who is there.
+        /// The available agents.
         available: String,
     },
     /// A tick that the scenario does not have.
@@ -105,35 +105,35 @@ pub enum StreamError {
     NoTick {
         /// The scenario.
         scenario: String,
-        /// Which was asked for.
+        /// The requested tick.
         asked: usize,
-        /// How many there are.
+        /// Number of ticks.
         ticks: usize,
     },
-    /// A rate that is none.
+    /// An invalid rate.
     #[error("rate is {0}, not a number from 0 to 1000")]
     Rate(f64),
-    /// The link makes no sense.
+    /// The link is invalid.
     #[error(transparent)]
     Link(#[from] LinkError),
-    /// A frame that is lost is never answered.
+    /// A lost frame is never answered.
     #[error("a link and lockstep exclude each other: a tick whose frames are late or lost is not answered")]
     LinkInLockstep,
-    /// The place to go on from makes no sense.
+    /// The checkpoint is invalid.
     #[error("bookmark: {0}")]
     Checkpoint(#[from] BookmarkError),
-    /// Not every route came up.
+    /// Not every route is up.
     #[error("the fleet is not ready: {0}")]
     NotReady(#[from] NotReady),
     /// The bus failed.
     #[error(transparent)]
     Bus(#[from] BusError),
     /// A thread could not be started.
-    #[error("no thread for reading ahead or noting the place: {0}")]
+    #[error("no thread for reading ahead or writing checkpoints: {0}")]
     Thread(std::io::Error),
 }
 
-/// A scene that is being played.
+/// A replay of a scene.
 pub struct Replay<'a> {
     bus: &'a Bus,
     options: StreamOptions,
@@ -147,7 +147,7 @@ pub struct Replay<'a> {
     present: BTreeSet<CavId>,
     clock: ReplayClock,
     outlet: SensorPublisher,
-    air: Option<SensorAir>,
+    sensor_link: Option<SensorLink>,
     inbox: Arc<Inbox>,
     stop: Stop,
     report: StreamReport,
@@ -156,10 +156,10 @@ pub struct Replay<'a> {
 }
 
 impl<'a> Replay<'a> {
-    /// Opens everything that the scene needs on the bus and begins to read; publishes nothing yet.
+    /// Opens the publishers and subscriptions of the scene and starts reading; publishes nothing yet.
     ///
     /// # Errors
-    /// [`StreamError`] when the scenario has no such agent or tick, or the bus refuses.
+    /// [`StreamError`] if the scenario has no such agent or tick, or the bus fails.
     pub fn prepare(
         bus: &'a Bus,
         scenario: &Scenario,
@@ -192,7 +192,7 @@ impl<'a> Replay<'a> {
         let verbs = [Verb::Start, Verb::Pause, Verb::Resume, Verb::Step, Verb::Seek].map(Topic::Control);
         let answers = options.lockstep.iter().map(|ego| Topic::Stream { cav: ego.clone(), stream: Stream::Detections });
         let subscriptions = verbs.into_iter().chain(answers).map(|topic| bus.subscribe(topic, &inbox));
-        let air = options.link.as_ref().map(|(link, seed)| SensorAir::new(link, *seed)).transpose()?;
+        let sensor_link = options.link.as_ref().map(|(link, seed)| SensorLink::new(link, *seed)).transpose()?;
         Ok(Self {
             bus,
             scenario: scenario.name.clone(),
@@ -205,7 +205,7 @@ impl<'a> Replay<'a> {
             clock,
             outlet: SensorPublisher::open(bus, &options.agents, options.load.radar, options.is_paced())?,
             _subscriptions: subscriptions.collect::<Result<_, _>>()?,
-            air,
+            sensor_link,
             inbox,
             stop: stop.clone(),
             report: place.as_ref().map(Place::report).unwrap_or_default(),
@@ -214,11 +214,10 @@ impl<'a> Replay<'a> {
         })
     }
 
-    /// Waits until every expected route has carried a probe. One that goes on where an earlier life was waits for a moment
-    /// only.
+    /// Waits until every expected route has carried a probe. A resumed replay waits for a short time only.
     ///
     /// # Errors
-    /// [`StreamError::NotReady`] names the routes that have not.
+    /// [`StreamError::NotReady`] with the routes that have not.
     pub fn wait_until_ready(&self) -> Result<(), StreamError> {
         let barrier = Barrier::new(self.expected_routes()).await_routes(self.bus)?;
         let stop = self.stop.clone();
@@ -227,23 +226,23 @@ impl<'a> Replay<'a> {
             return Ok(wait(self.options.patience)?);
         }
         let (tick, ticks) = (self.schedule.position().next_tick, self.tick_count);
-        tracing::warn!(tick, ticks, "going on where an earlier life was");
+        tracing::warn!(tick, ticks, "resuming from the checkpoint of the previous process instance");
         if let Err(not_ready) = wait(RESUME_PATIENCE.min(self.options.patience)) {
-            tracing::warn!("the world goes on, though {not_ready}");
+            tracing::warn!("the replay continues, although {not_ready}");
         }
         Ok(())
     }
 
-    /// Plays the scene to its end, or until someone asks to stop. Sends the end markers, and returns when the network
-    /// has taken everything.
+    /// Plays the scene to its end, or until a stop is requested. Sends the end markers, and returns when all messages
+    /// have left the process.
     #[must_use]
     pub fn play(mut self) -> StreamReport {
         let began = Instant::now();
         let mut last = began;
-        // Without a pace of its own it may wait for its slowest agent for any time.
+        // Paced by its subscribers, it may wait for the slowest agent for any time.
         let working = (!self.options.is_paced()).then(|| self.bus.works_from(&self.inbox));
         while let Some((planned, due)) = self.wait_for_next() {
-            // One that is late takes nothing from its inbox.
+            // A late replay takes nothing from its inbox.
             if let Some(working) = &working {
                 working.beat();
             }
@@ -254,8 +253,8 @@ impl<'a> Replay<'a> {
         }
         self.await_the_last();
         drop(working);
-        let Self { bus, outlet, air, mut report, .. } = self;
-        report.air = air.map(|air| air.report().clone());
+        let Self { bus, outlet, sensor_link, mut report, .. } = self;
+        report.air = sensor_link.map(|link| link.report().clone());
         report.seconds = last.duration_since(began).as_secs_f64();
         report.lateness.sum_up();
         report.sent = outlet.finish();
@@ -279,10 +278,10 @@ impl<'a> Replay<'a> {
         agents.flat_map(sensors).chain(answers).chain(self.options.expect.iter().cloned()).collect()
     }
 
-    /// The next tick and when it is due, at that moment. `None`: the scene is over, or someone asked to stop.
+    /// The next tick with its due time, at that time. `None`: the scene has ended, or a stop was requested.
     fn wait_for_next(&mut self) -> Option<(Planned, Instant)> {
         loop {
-            // A command may change what comes next, so the plan is made anew each time.
+            // A command may change the next tick, so the plan is renewed each time.
             let planned = self.schedule.clone().next()?;
             let due = self.clock.due(planned.capture_nanos, Instant::now());
             self.deliver();
@@ -306,20 +305,20 @@ impl<'a> Replay<'a> {
         }
     }
 
-    /// When the next frame that is on its way can arrive.
+    /// Time at which the next frame in flight can arrive.
     fn next_arrival(&self) -> Option<Instant> {
-        self.air.as_ref().and_then(SensorAir::next)
+        self.sensor_link.as_ref().and_then(SensorLink::next)
     }
 
-    /// Publishes the frames that have crossed the air.
+    /// Publishes the frames that have passed the emulated link.
     fn deliver(&mut self) {
-        let Some(air) = &mut self.air else { return };
-        for DelayedSweep { agent, capture_nanos, frame } in air.arrived(Instant::now()) {
+        let Some(link) = &mut self.sensor_link else { return };
+        for DelayedSweep { agent, capture_nanos, frame } in link.arrived(Instant::now()) {
             self.outlet.offer(agent, capture_nanos, frame);
         }
     }
 
-    /// After the last tick: waits for the frames that are on their way, unless someone asks to stop.
+    /// After the last tick: waits for the frames in flight, unless a stop is requested.
     fn await_the_last(&mut self) {
         while let Some(next) = self.next_arrival().filter(|_| !self.stop.requested()) {
             if matches!(self.inbox.take(Some(next)), Pop::Closed) {
@@ -329,7 +328,7 @@ impl<'a> Replay<'a> {
         }
     }
 
-    /// After everything of a tick was handed over: what comes next is for the next life.
+    /// After a tick was submitted completely: a restarted replay resumes with the next one.
     fn note_place(&self) {
         let Some(bookmark) = &self.bookmark else { return };
         let StreamReport { ticks, unanswered, unreadable_frames, .. } = self.report;
@@ -375,11 +374,11 @@ impl<'a> Replay<'a> {
             match frame {
                 Ok(frame) => {
                     self.report.parts_left_out(&frame);
-                    match &mut self.air {
+                    match &mut self.sensor_link {
                         None => self.outlet.offer(agent, capture_nanos, frame),
-                        Some(air) => {
+                        Some(link) => {
                             let cav = frame.cav.clone();
-                            air.offer(&cav, DelayedSweep { agent, capture_nanos, frame }, Instant::now());
+                            link.offer(&cav, DelayedSweep { agent, capture_nanos, frame }, Instant::now());
                         }
                     }
                 }
@@ -393,7 +392,7 @@ impl<'a> Replay<'a> {
         self.clock.published(capture_nanos, due);
     }
 
-    /// Under lockstep, waits until every ego that has a frame at the tick has answered.
+    /// In lockstep, waits until every ego that has a frame at the tick has answered.
     fn wait_for_answers(&mut self, planned: &Planned) {
         if self.options.lockstep.is_empty() {
             return;
@@ -424,12 +423,12 @@ impl<'a> Replay<'a> {
                 Pop::Closed => break,
             }
         }
-        // The fleet sets the pace: the next tick is not late because this one took long.
+        // The subscribers set the pace: the next tick is not late because this one took long.
         self.clock.rebase();
     }
 }
 
-/// When a patience that begins now is over; `None`: never, where no clock reaches that far.
+/// End of a timeout that begins now; `None` if it is beyond the range of the clock: no end.
 fn end_of(patience: Duration) -> Option<Instant> {
     Instant::now().checked_add(patience)
 }

@@ -1,4 +1,4 @@
-//! How a replay went.
+//! Report of a replay.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -13,34 +13,34 @@ use support::statistics::{quantile, sorted};
 
 /// Publishing later than this counts as late.
 const LATE: Duration = Duration::from_millis(5);
-/// Unreadable frames that are kept with their message.
+/// Largest number of unreadable frames whose message is kept.
 const KEPT: usize = 100;
 
-/// How a replay went.
+/// Report of a replay.
 #[derive(Debug, Clone, Default, Serialize)]
 pub struct StreamReport {
     /// Ticks published.
     pub ticks: u64,
     /// Seconds from the first tick to the last.
     pub seconds: f64,
-    /// Messages offered for sending, by topic.
+    /// Messages submitted, by topic.
     pub sent: Vec<TopicCount>,
-    /// Of these, never sent, by reason: at a pace of its own a newer sweep takes the place of one that still waits for the
+    /// Of these, never sent, by reason: with a pace of its own a newer sweep replaces one that still waits for the
     /// network.
     pub unsent: BTreeMap<DropReason, u64>,
-    /// How late ticks were; empty where the fleet set the pace.
+    /// Lateness of ticks; empty if the subscribers set the pace.
     pub lateness: Lateness,
     /// Ticks that an ego did not answer in time, under `--lockstep`.
     pub unanswered: u64,
-    /// Frames that do not exist: their vehicle came later or has left. No failure.
+    /// Frames that do not exist because their vehicle joined later or has left. Not a failure.
     pub absent_frames: u64,
-    /// Objects and other parts of frames that were left out, because they cannot be right.
+    /// Objects and other parts of frames that were left out because they are invalid.
     pub left_out_parts: u64,
     /// Frames that could not be read.
     pub unreadable_frames: u64,
-    /// The first of them.
+    /// The first of the unreadable frames.
     pub unreadable: Vec<Unreadable>,
-    /// What the emulated air did to sensor frames, where there was one.
+    /// Counters of sensor frames on the emulated link, if there is one.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub air: Option<AirReport>,
 }
@@ -50,11 +50,11 @@ pub struct StreamReport {
 pub struct Unreadable {
     /// Capture time of its tick, nanoseconds.
     pub capture_nanos: u64,
-    /// File, field and what is wrong.
+    /// File, field and fault.
     pub error: String,
 }
 
-/// How much later than due ticks were published.
+/// Delay of the publication of ticks after their due time.
 #[derive(Debug, Clone, Default, Serialize)]
 pub struct Lateness {
     /// Ticks that were more than 5 ms late.
@@ -78,7 +78,7 @@ impl StreamReport {
         }
     }
 
-    /// Takes from the books what this process has dropped itself, and says so in the log.
+    /// Adds the messages that this process dropped itself, from its message counters, and logs them.
     pub(super) fn count_unsent(&mut self, ledger: &Ledger) {
         let own = ledger.iter().filter(|(account, _)| account.to.is_none());
         for (reason, count) in own.flat_map(|(_, counts)| &counts.dropped) {
@@ -96,8 +96,8 @@ impl StreamReport {
         self.left_out_parts += frame.problems.len() as u64;
     }
 
-    /// Whether every frame could be read whole and every tick was answered that had to be. What newer messages took the place of
-    /// ([`Self::unsent`]) is no failure.
+    /// True if every frame was read completely and every tick was answered as required. Replaced messages
+    /// ([`Self::unsent`]) are no failure.
     #[must_use]
     pub fn is_complete(&self) -> bool {
         self.unreadable_frames == 0 && self.left_out_parts == 0 && self.unanswered == 0
@@ -133,7 +133,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_was_dropped_before_it_was_sent_is_told() {
+    fn messages_dropped_before_sending_are_reported() {
         let published = |topic: &str| Account::published(topic.parse().unwrap());
         let mut ledger = Ledger::default();
         for topic in ["1/lidar", "2/lidar", "1/gnss"] {
@@ -141,8 +141,8 @@ mod tests {
         }
         ledger.dropped(&published("1/lidar"), DropReason::Superseded);
         ledger.dropped(&published("2/lidar"), DropReason::Superseded);
-        let heard = Account::towards("1/detections".parse().unwrap(), &"replay".parse().unwrap());
-        ledger.dropped(&heard, DropReason::Superseded);
+        let subscribed = Account::towards("1/detections".parse().unwrap(), &"replay".parse().unwrap());
+        ledger.dropped(&subscribed, DropReason::Superseded);
         let mut report = StreamReport::default();
         report.count_unsent(&ledger);
         assert_eq!(report.unsent, [(DropReason::Superseded, 2)].into());

@@ -1,4 +1,4 @@
-//! Which tick comes next, and at what time of the scene.
+//! Schedule: order of ticks, and their capture times on the replay's clock.
 
 use std::sync::Arc;
 
@@ -6,37 +6,37 @@ use serde::{Deserialize, Serialize};
 
 use dataset::Tick;
 
-/// Between two ticks where a scene has only one, nanoseconds.
+/// Period of a scene with only one tick, nanoseconds.
 const SINGLE_TICK_PERIOD: u64 = 100_000_000;
 
-/// One tick that is to be published.
+/// One tick to be published.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Planned {
-    /// Its place in the scenario's ticks.
+    /// Its index in the scenario's ticks.
     pub tick_index: usize,
-    /// Capture time on the clock of the replay, nanoseconds: the recorded one until the replay first goes back.
+    /// Capture time on the clock of the replay, nanoseconds: the recorded one until the first jump back.
     pub capture_nanos: u64,
 }
 
-/// Where a schedule is.
+/// State of a schedule.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Position {
-    /// The tick that comes next.
+    /// The next tick.
     pub next_tick: usize,
-    /// Ticks that are left to play; `None`: to the end of the scene, or for ever.
+    /// Ticks left to play; `None`: to the end of the scene, or without end.
     pub left: Option<usize>,
-    /// By how much capture times are shifted, nanoseconds.
+    /// Shift of capture times, nanoseconds.
     pub shift_nanos: u64,
     /// Capture time of the last tick, nanoseconds.
     pub last_nanos: Option<u64>,
 }
 
-/// The order of ticks under seeking, looping and a limit. A clone of it looks ahead.
+/// The order of ticks with seeking, looping and a limit. Iterating over a clone gives the ticks ahead.
 ///
-/// Capture times always rise, as if the cars went on driving: whoever pairs by capture time must not see one twice.
-/// After a jump back (a loop, or a seek) all times are shifted so that the next tick follows the last at the scene's
-/// pace.
+/// Capture times always rise, as if the vehicles drove on: a receiver that pairs by capture time must not get one
+/// twice. After a jump back (a loop, or a seek) all times are shifted so that the next tick follows the last at the
+/// scene's pace.
 #[derive(Debug, Clone)]
 pub struct Schedule {
     captures: Arc<[u64]>,
@@ -61,25 +61,25 @@ impl Schedule {
         }
     }
 
-    /// Goes on where an earlier life has been, with its capture times.
+    /// Resumes at the state of the previous process instance, with its capture times.
     #[must_use]
     pub fn resumed(self, position: Position) -> Self {
         let Position { next_tick, left, shift_nanos, last_nanos } = position;
         Self { next_index: next_tick, left, shift_nanos, last_nanos, ..self }
     }
 
-    /// Where it is.
+    /// Its state.
     pub(super) fn position(&self) -> Position {
         let Self { next_index: next_tick, left, shift_nanos, last_nanos, .. } = *self;
         Position { next_tick, left, shift_nanos, last_nanos }
     }
 
-    /// Goes on from tick `index` instead.
+    /// Continues from tick `index` instead.
     pub fn seek(&mut self, index: usize) {
         self.next_index = index;
     }
 
-    /// The ticks that come next, at most `count`.
+    /// The next ticks, at most `count`.
     #[must_use]
     pub fn ahead(&self, count: usize) -> Vec<usize> {
         self.clone().take(count).map(|planned| planned.tick_index).collect()
@@ -145,7 +145,7 @@ mod tests {
     }
 
     #[test]
-    fn a_second_life_goes_on_where_the_first_was() {
+    fn a_restarted_schedule_resumes_where_the_first_ended() {
         let ticks = ticks(&[100, 200, 350]);
         let whole = Schedule::new(&ticks, 1, Some(9), true);
         let mut first = whole.clone();

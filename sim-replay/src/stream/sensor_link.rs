@@ -1,4 +1,4 @@
-//! What vehicles measure, late or lost: the emulated air between a replayed sensor and its vehicle's agent.
+//! Sensor link: link emulation between a replayed sensor and its vehicle's agent.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -14,43 +14,43 @@ use support::nanos;
 /// x, y, z and intensity of a point, bytes; for a radar's its velocity.
 const POINT_BYTES: u64 = 16;
 
-/// What became of replayed sensor frames on their way.
+/// Counters of replayed sensor frames on the link.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
 pub struct AirReport {
-    /// Frames that were measured.
+    /// Frames submitted.
     pub offered: u64,
     /// Frames that reached their agent, copies counted.
     pub arrived: u64,
-    /// Frames that did not, by reason.
+    /// Frames that did not reach their agent, by reason.
     pub dropped: BTreeMap<DropReason, u64>,
 }
 
-/// A frame on its way.
+/// A frame in flight.
 #[derive(Debug, Clone)]
 pub(super) struct DelayedSweep {
-    /// Place of the vehicle among those that take part.
+    /// Index of the vehicle among those that take part.
     pub(super) agent: usize,
     pub(super) capture_nanos: u64,
     pub(super) frame: Frame,
 }
 
-/// Frames on their way to the agents.
-pub(super) struct SensorAir {
-    air: LinkEmulator,
+/// Frames in flight to the agents.
+pub(super) struct SensorLink {
+    emulator: LinkEmulator,
     held: BTreeMap<u64, DelayedSweep>,
     next_id: u64,
-    /// By vehicle, as its own messages are numbered: whether one is lost must not depend on who else is there.
+    /// By vehicle, as for its own messages: losses must not depend on the other vehicles.
     next_sequences: BTreeMap<CavId, u64>,
     began: Instant,
     report: AirReport,
 }
 
-impl SensorAir {
+impl SensorLink {
     /// # Errors
-    /// [`LinkError`] names the field that is wrong.
+    /// [`LinkError`] with the invalid field.
     pub(super) fn new(link: &LinkConfig, seed: u64) -> Result<Self, LinkError> {
         Ok(Self {
-            air: LinkEmulator::new(link.clone(), Path::new("."), seed)?,
+            emulator: LinkEmulator::new(link.clone(), Path::new("."), seed)?,
             held: BTreeMap::new(),
             next_id: 0,
             next_sequences: BTreeMap::new(),
@@ -59,7 +59,7 @@ impl SensorAir {
         })
     }
 
-    /// Takes what the vehicle `cav` measured just now. What its sensors measured at a tick travels together.
+    /// Submits the current frame of vehicle `cav`. Data of all its sensors at a tick are transmitted together.
     pub(super) fn offer(&mut self, cav: &CavId, held: DelayedSweep, now: Instant) {
         let Frame { points, radar, .. } = &held.frame;
         let points = points.len() + radar.as_ref().map_or(0, |radar| radar.len());
@@ -72,25 +72,25 @@ impl SensorAir {
         self.report.offered += 1;
         self.held.insert(id, held);
         let (from, to, stream) = (cav.clone(), cav.clone(), Stream::Lidar);
-        self.air.offer(Packet { id, from, to, stream, sequence, bytes, offered_nanos, distance_m: 0.0 });
+        self.emulator.offer(Packet { id, from, to, stream, sequence, bytes, offered_nanos, distance_m: 0.0 });
     }
 
-    /// When the next frame can arrive; none while none is under way.
+    /// Time at which the next frame can arrive; `None` while none is in flight.
     pub(super) fn next(&self) -> Option<Instant> {
-        self.air.next_nanos().map(|nanos| self.began + Duration::from_nanos(nanos))
+        self.emulator.next_nanos().map(|nanos| self.began + Duration::from_nanos(nanos))
     }
 
-    /// What has arrived by now.
+    /// Frames that have arrived by now.
     pub(super) fn arrived(&mut self, now: Instant) -> Vec<DelayedSweep> {
         let mut arrived = Vec::new();
-        for Outcome { parcel, fate, .. } in self.air.advance(nanos::between(self.began, now)) {
-            match fate {
+        for Outcome { parcel: packet, fate: delivery, .. } in self.emulator.advance(nanos::between(self.began, now)) {
+            match delivery {
                 Delivery::Dropped(reason) => {
-                    self.held.remove(&parcel.id);
+                    self.held.remove(&packet.id);
                     *self.report.dropped.entry(reason).or_default() += 1;
                 }
-                Delivery::Arrived { is_repeated: true, .. } => arrived.extend(self.held.get(&parcel.id).cloned()),
-                Delivery::Arrived { .. } => arrived.extend(self.held.remove(&parcel.id)),
+                Delivery::Arrived { is_repeated: true, .. } => arrived.extend(self.held.get(&packet.id).cloned()),
+                Delivery::Arrived { .. } => arrived.extend(self.held.remove(&packet.id)),
             }
         }
         self.report.arrived += arrived.len() as u64;
@@ -116,16 +116,16 @@ mod tests {
     }
 
     #[test]
-    fn what_a_vehicle_loses_does_not_depend_on_the_others() {
+    fn losses_of_a_vehicle_do_not_depend_on_the_others() {
         let [cav, other] = ["7", "8"].map(|cav| CavId::new(cav).unwrap());
         let lossy = LinkConfig { loss: LossModel::Bernoulli(0.5), ..LinkConfig::default() };
         let arrived = |cavs: &[&CavId]| {
-            let mut air = SensorAir::new(&lossy, 1).unwrap();
-            let began = air.began;
+            let mut link_under_test = SensorLink::new(&lossy, 1).unwrap();
+            let began = link_under_test.began;
             for tick in 0..100 {
-                cavs.iter().for_each(|cav| air.offer(cav, held(cav, tick), began));
+                cavs.iter().for_each(|cav| link_under_test.offer(cav, held(cav, tick), began));
             }
-            let arrived = air.arrived(began).into_iter().filter(|held| held.frame.cav == cav);
+            let arrived = link_under_test.arrived(began).into_iter().filter(|held| held.frame.cav == cav);
             arrived.map(|held| held.capture_nanos).collect::<Vec<_>>()
         };
         assert_eq!(arrived(&[&other, &cav]), arrived(&[&cav]));
@@ -140,20 +140,20 @@ mod tests {
             delay: DelayModel::ConstantMs(100.0),
             ..LinkConfig::default()
         };
-        let mut air = SensorAir::new(&link, 1).unwrap();
+        let mut link_under_test = SensorLink::new(&link, 1).unwrap();
         let at = Duration::from_millis;
-        let began = air.began;
-        air.offer(&cav, held(&cav, 0), began);
-        air.offer(&cav, held(&cav, 1), began);
-        assert!(air.arrived(began + at(107)).is_empty());
-        let first = air.arrived(began + at(110));
+        let began = link_under_test.began;
+        link_under_test.offer(&cav, held(&cav, 0), began);
+        link_under_test.offer(&cav, held(&cav, 1), began);
+        assert!(link_under_test.arrived(began + at(107)).is_empty());
+        let first = link_under_test.arrived(began + at(110));
         assert_eq!(first.iter().map(|held| held.capture_nanos).collect::<Vec<_>>(), [0]);
-        assert!(air.next().is_some_and(|next| next > began + at(110)));
-        assert_eq!(air.arrived(began + at(120)).len(), 1);
-        assert_eq!(air.next(), None);
+        assert!(link_under_test.next().is_some_and(|next| next > began + at(110)));
+        assert_eq!(link_under_test.arrived(began + at(120)).len(), 1);
+        assert_eq!(link_under_test.next(), None);
 
         let mut lossy =
-            SensorAir::new(&LinkConfig { loss: LossModel::Bernoulli(0.5), ..LinkConfig::default() }, 1).unwrap();
+            SensorLink::new(&LinkConfig { loss: LossModel::Bernoulli(0.5), ..LinkConfig::default() }, 1).unwrap();
         let began = lossy.began;
         (0..200).for_each(|tick| lossy.offer(&cav, held(&cav, tick), began));
         let arrived = lossy.arrived(began).len() as u64;

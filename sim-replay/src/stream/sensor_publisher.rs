@@ -1,4 +1,4 @@
-//! The topics of a replayed scene: each vehicle's sensors, and the truth.
+//! Publishers of a replayed scene: each vehicle's sensors, and the ground truth.
 
 use protocol::message::{AgentTruth, TrueObject};
 use protocol::{CavId, Gnss, GnssSource, Lidar, Radar, Stream, Topic, TopicCount, Truth};
@@ -7,9 +7,9 @@ use bus::{Bus, BusError, Publisher, PublisherOptions};
 use dataset::frame::{Frame, Object};
 use dataset::ground_truth::annotations;
 
-/// Places in the queue of a topic of which nothing may be lost.
+/// Queue length of a lossless topic.
 const LOSSLESS_PLACES: usize = 16;
-/// Points of a preview: so many that it still fits into one batch of zenoh's.
+/// Points of a preview: it must fit into one batch of zenoh.
 const PREVIEW_POINTS: usize = 4_000;
 
 /// The sensors of one vehicle.
@@ -20,7 +20,7 @@ struct Sensors {
     preview: Publisher,
 }
 
-/// Everything a replay publishes.
+/// All publishers of a replay.
 pub(super) struct SensorPublisher {
     sensors: Vec<Sensors>,
     truth: Publisher,
@@ -28,7 +28,7 @@ pub(super) struct SensorPublisher {
 }
 
 impl SensorPublisher {
-    /// Publishers for `agents`. Under `is_paced` the sender waits rather than that a sweep be superseded.
+    /// Publishers for `agents`. With `is_paced` the sender waits instead of replacing a sweep.
     pub(super) fn open(bus: &Bus, agents: &[CavId], with_radar: bool, is_paced: bool) -> Result<Self, BusError> {
         let options =
             if is_paced { PublisherOptions::SENSOR.lossless(LOSSLESS_PLACES) } else { PublisherOptions::SENSOR };
@@ -48,11 +48,11 @@ impl SensorPublisher {
         Ok(Self { sensors: sensors.collect::<Result<_, _>>()?, truth, sent: Vec::new() })
     }
 
-    /// Offers what one vehicle measured, as captured at `capture_nanos`.
+    /// Submits the data of one vehicle captured at `capture_nanos`.
     pub(super) fn offer(&mut self, agent: usize, capture_nanos: u64, frame: Frame) {
         let Some(sensors) = self.sensors.get(agent) else { return };
         if let Some(world_from_lidar) = frame.world_from_lidar {
-            // The pose goes first: it is small, and the sweep is of no use without it.
+            // The pose is sent first: it is small, and the sweep cannot be used without it.
             let source = GnssSource::Recorded;
             let gnss = Gnss { world_from_lidar, position_std_m: 0.0, heading_std_rad: 0.0, source };
             sensors.gnss.offer(capture_nanos, gnss);
@@ -69,13 +69,13 @@ impl SensorPublisher {
         }
     }
 
-    /// Offers the truth of one tick.
+    /// Submits the ground truth of one tick.
     pub(super) fn offer_truth(&mut self, capture_nanos: u64, truth: Truth) {
         self.truth.offer(capture_nanos, truth);
         count(&mut self.sent, self.truth.topic());
     }
 
-    /// Sends what is queued and ends every topic; says how much was offered on each.
+    /// Sends queued messages and ends every topic; returns the number of submitted messages by topic.
     pub(super) fn finish(self) -> Vec<TopicCount> {
         for Sensors { lidar, gnss, radar, preview } in self.sensors {
             [Some(lidar), Some(gnss), radar, Some(preview)].into_iter().flatten().for_each(Publisher::finish);
@@ -92,8 +92,8 @@ fn count(sent: &mut Vec<TopicCount>, topic: &Topic) {
     }
 }
 
-/// What of the frames of a tick is true: where their vehicles are, and what each of them adds to the truth of the tick.
-/// Vehicles whose pose the recording does not know are left out.
+/// The ground truth of the frames of a tick: poses of the vehicles, and the objects that each of them contributes.
+/// Vehicles without a recorded pose are left out.
 pub(super) fn truth_of(frames_of_tick: &[&Frame]) -> Vec<AgentTruth> {
     let truth = |(frame, objects): (&&Frame, &[Object])| {
         let world_from_lidar = frame.world_from_lidar?;

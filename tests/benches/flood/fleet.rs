@@ -1,4 +1,4 @@
-//! The processes of the flood: each a call of this program with `part NAME ENDPOINT KEYS SHM_MIB SECONDS`.
+//! Processes of the flood: each a call of this program with `part NAME ENDPOINT KEYS SHM_MIB SECONDS`.
 
 use std::fs;
 use std::io::{BufRead, BufReader, Write};
@@ -30,32 +30,32 @@ const HONEST: [&str; 3] = ["1", "2", "3"];
 pub(crate) const FLOODING: [&str; 4] = ["4", "5", "6", "7"];
 const PERIOD: Duration = Duration::from_millis(100);
 const FLOOD_PERIOD: Duration = Duration::from_millis(1);
-/// Before anything is measured.
+/// Warm-up before the measurement.
 const WARM_UP: Duration = Duration::from_secs(3);
-/// For a process to end.
+/// Longest time until a process ends.
 const PATIENCE: Duration = Duration::from_secs(5);
 
-/// What is measured.
+/// Setting of a measurement.
 pub(crate) struct Setting {
-    /// Keys, where QUIC is spoken.
+    /// Folder of the keys, with QUIC.
     pub(crate) keys: Option<PathBuf>,
-    /// How many of [`FLOODING`] do.
+    /// Number of flooding senders, of [`FLOODING`].
     pub(crate) floods: usize,
-    /// Shared memory of each process; 0: none.
+    /// Shared memory of each process, MiB; 0: none.
     pub(crate) shm_mib: usize,
     pub(crate) duration: Duration,
 }
 
-/// What came of it.
+/// Result of a measurement.
 #[derive(Serialize, Deserialize, Default)]
 pub(crate) struct Measured {
-    /// Of the honest vehicles' maps.
+    /// Latencies of the honest vehicles' feature maps.
     pub(crate) latencies_ms: Vec<f64>,
-    /// Of router, ego and honest vehicles together.
+    /// Processor time of router, ego and honest vehicles together.
     pub(crate) cpu_ms: f64,
     pub(crate) ego_mib: f64,
     pub(crate) router_mib: f64,
-    /// Messages of the flood: that went out, that the ego did not look at, that it decoded.
+    /// Messages of the flood: sent, rejected by the ego before decoding, decoded by the ego.
     pub(crate) sent: u64,
     pub(crate) refused: u64,
     pub(crate) decoded: u64,
@@ -65,7 +65,7 @@ pub(crate) fn quantile(values: &[f64], quantile: f64) -> f64 {
     statistics::quantile(&statistics::sorted(values), quantile).unwrap_or(f64::NAN)
 }
 
-/// RunScope the fleet once.
+/// Runs the fleet once.
 pub(crate) fn measure(setting: &Setting) -> Result<Measured> {
     let endpoint = Endpoint::loopback(free_port());
     let seconds = (setting.duration + WARM_UP).as_secs_f64();
@@ -106,12 +106,12 @@ pub(crate) fn measure(setting: &Setting) -> Result<Measured> {
     [measured.ego_mib, measured.router_mib] = peaks;
     measured.cpu_ms = cpu_ms;
     drop((honest, router));
-    // Processes that end together leave what the others still held.
+    // The last process to end removes the segments that the others still held.
     zenoh::shm::cleanup_orphaned_shm_segments();
     Ok(measured)
 }
 
-/// A process; ended with this, and killed if that takes long. One that is killed leaves its shared memory behind.
+/// A process that is ended when dropped, and killed after a timeout. A killed one leaves its shared memory behind.
 struct Part {
     child: Child,
     lines: BufReader<std::process::ChildStdout>,
@@ -144,7 +144,7 @@ fn cpu_ms(pids: &[u32]) -> Result<f64> {
     pids.iter().try_fold(0.0, |sum, pid| Ok(sum + machine::cpu_ms(*pid)?))
 }
 
-/// Without what is shared: that is the size of the pools, which everyone maps.
+/// Without shared memory: that is the size of the pools, which every process maps.
 fn resident_mib(pid: u32) -> f64 {
     let status = fs::read_to_string(format!("/proc/{pid}/status")).unwrap_or_default();
     let kib = |name: &str| {
@@ -154,7 +154,7 @@ fn resident_mib(pid: u32) -> f64 {
     (kib("RssAnon:") + kib("RssFile:")) / 1024.0
 }
 
-/// What one process does.
+/// Runs one process.
 pub(crate) fn run_part(arguments: &[String]) -> Result<()> {
     let [name, endpoint, keys, shm_mib, seconds] = arguments else { bail!("part NAME ENDPOINT KEYS SHM_MIB SECONDS") };
     let place = Place {
@@ -182,12 +182,12 @@ impl Place {
         BusOptions { shared_memory_pool: self.shm, ..options }
     }
 
-    fn join(&self, party: &str) -> Result<Bus> {
-        let known: Principal = party.parse()?;
+    fn join(&self, principal: &str) -> Result<Bus> {
+        let known: Principal = principal.parse()?;
         let identity = Identity { run: RunId::new("flood")?, process: known.name(), cav: known.cav };
         let options = self.with_memory(BusOptions::client(self.endpoint.clone()));
         let options = match &self.keys {
-            Some(keys) => options.with_credentials(Credentials::read(&keys.join(party))?),
+            Some(keys) => options.with_credentials(Credentials::read(&keys.join(principal))?),
             None => options,
         };
         Ok(Bus::join(&options, identity)?)
@@ -201,7 +201,7 @@ impl Place {
             options = options.with_credentials(credentials).with_access_control(guard);
         }
         let session = open(&options)?;
-        say("ready")?;
+        print("ready")?;
         let _ = std::io::stdin().lines().next();
         session.close().wait().map_err(anyhow::Error::from_boxed)
     }
@@ -212,7 +212,7 @@ impl Place {
         let flooding = FLOODING.map(bev);
         let subscriptions = HONEST.iter().chain(&FLOODING).map(|cav| ego.subscribe(bev(cav), &inbox));
         let subscriptions = subscriptions.collect::<Result<Vec<_>, _>>()?;
-        say("ready")?;
+        print("ready")?;
         let (began, mut measured) = (Instant::now(), Measured::default());
         let until = began + duration;
         while Instant::now() < until {
@@ -233,7 +233,7 @@ impl Place {
             let refused = ledger.get(&here).and_then(|counts| counts.dropped.get(&DropReason::RateLimit));
             measured.refused += refused.copied().unwrap_or(0);
         }
-        say(&serde_json::to_string(&measured)?)?;
+        print(&serde_json::to_string(&measured)?)?;
         drop(subscriptions);
         Ok(ego.leave(PATIENCE)?)
     }
@@ -242,7 +242,7 @@ impl Place {
         let buses = HONEST.iter().map(|cav| self.join(&format!("agent-{cav}"))).collect::<Result<Vec<_>>>()?;
         let publishers = buses.iter().zip(HONEST).map(|(bus, cav)| bus.publisher(bev(cav), PublisherOptions::FEATURES));
         let publishers = publishers.collect::<Result<Vec<_>, _>>()?;
-        say("ready")?;
+        print("ready")?;
         let (began, pose) = (Instant::now(), PoseEstimate::new(Pose::IDENTITY, 1.0));
         let maps: Vec<BevFeatures> = (0..HONEST.len()).map(|_| map_of(64)).collect();
         for turn in 0.. {
@@ -261,13 +261,13 @@ impl Place {
         buses.into_iter().try_for_each(|bus| Ok(bus.leave(PATIENCE)?))
     }
 
-    /// Sound messages of its own vehicle, as many as the network takes.
+    /// Valid messages of its own vehicle, as many as the network takes.
     fn flood(&self, cav: &str, duration: Duration) -> Result<()> {
         let bus = self.join(&format!("agent-{cav}"))?;
         let key = bus.key(bev(cav)).to_string();
         let pose = PoseEstimate::new(Pose::IDENTITY, 1.0);
         let features = encode_features(map_of(0), &CodecConfig::default(), None)?;
-        say("ready")?;
+        print("ready")?;
         let began = Instant::now();
         let mut sent = 0_u64;
         while began.elapsed() < duration {
@@ -283,7 +283,7 @@ impl Place {
             let due = FLOOD_PERIOD * u32::try_from(sent)?;
             thread::sleep(due.saturating_sub(began.elapsed()));
         }
-        say(&sent.to_string())?;
+        print(&sent.to_string())?;
         Ok(bus.leave(PATIENCE)?)
     }
 }
@@ -292,7 +292,7 @@ fn bev(cav: &str) -> Topic {
     format!("{cav}/bev").parse().expect("a topic")
 }
 
-/// A map of 1.6 MB (`rows` 64: 100 x 64 cells of 64 channels), or one of 1 MiB (`rows` 0).
+/// A feature map of 1.6 MB (`rows` 64: 100 x 64 cells of 64 channels), or one of 1 MiB (`rows` 0).
 fn map_of(rows: u32) -> BevFeatures {
     let (channels, width, height) = if rows == 0 { (64, 64, 64) } else { (64, 100, rows) };
     let grid = BevGrid { x_min_m: -51.2, y_min_m: -38.4, cell_m: 0.8, width, height };
@@ -300,7 +300,7 @@ fn map_of(rows: u32) -> BevFeatures {
     BevFeatures { grid, channels, code_of: None, values }
 }
 
-fn say(line: &str) -> Result<()> {
+fn print(line: &str) -> Result<()> {
     let mut out = std::io::stdout();
     writeln!(out, "{line}")?;
     Ok(out.flush()?)

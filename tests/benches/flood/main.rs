@@ -1,18 +1,19 @@
-//! What a flood from one authenticated peer costs the others, and what QUIC costs everyone.
+//! Benchmark of a flood: its cost for other processes, and the cost of QUIC for all.
 //!
-//! Three vehicles send maps of 1.6 MB ten times a second to an ego; a fourth (`--floods`: as many as four more), with a
-//! certificate of the same fleet, sends 1 MiB as often as it can, up to 1000 times a second. Router, ego, the three and each
-//! that floods are processes of this program.
+//! Three vehicles send feature maps of 1.6 MB ten times a second to an ego; a fourth (`--floods`: as many as four
+//! more), with a certificate of the same fleet, sends 1 MiB as often as it can, up to 1000 times a second. Router, ego,
+//! the three vehicles and each flooding one are processes of this program.
 //!
 //! ```text
 //! cargo bench -p tests --bench flood [-- --seconds 20 --shm-mib 256 --floods 1 --out deploy/results/security-flood.md]
 //! ```
 //!
-//! With `--shm-mib` large messages go through shared memory, of that size for each process: a flood then costs its sender a
-//! copy and the network little, so that it is what was asked for and not what the sockets let through.
+//! With `--shm-mib` large messages go through shared memory, of that size for each process: a flood then costs its
+//! sender a copy and the network little, so that the flood has the requested rate and not the throughput of the
+//! sockets.
 //!
-//! Latency: from the moment a map is encoded to that in which it is decoded at the ego. Processor time is for each map of the
-//! three. Memory: resident size of the ego and the router, at most.
+//! Latency: from the encoding of a feature map to its decoding at the ego. Processor time is for each feature map of
+//! the three. Memory: largest resident size of the ego and the router.
 
 mod fleet;
 
@@ -27,7 +28,7 @@ use tests::machine;
 
 use fleet::{FLOODING, Measured, Setting};
 
-/// Others' 99th percentile under the flood, in times of that without it.
+/// Largest ratio of the others' 99th percentile with and without the flood.
 const AT_MOST: f64 = 2.0;
 
 fn main() -> ExitCode {
@@ -62,11 +63,11 @@ fn bench(arguments: &[String]) -> Result<bool> {
     }
     let folder = tempfile::tempdir()?;
     let agents = (1..=7).map(|cav| format!("agent-{cav}"));
-    let parties = agents.chain(["ego-9".into(), "replay".into()]).map(|party| party.parse());
-    let parties = parties.collect::<Result<_, _>>()?;
-    make(&KeyPlan::new(folder.path(), parties, 1))?;
+    let principals = agents.chain(["ego-9".into(), "replay".into()]).map(|principal| principal.parse());
+    let principals = principals.collect::<Result<_, _>>()?;
+    make(&KeyPlan::new(folder.path(), principals, 1))?;
     let mut rows = Vec::new();
-    // They take turns, so that a machine that is busier in one minute than in the next does not decide.
+    // The settings alternate, so that a change in the load of the machine does not favour one.
     for _ in 0..2 {
         for (secured, flood) in [(false, false), (true, false), (false, true), (true, true)] {
             let keys = secured.then(|| folder.path().to_path_buf());

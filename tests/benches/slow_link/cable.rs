@@ -1,6 +1,6 @@
-//! A real slow link: two network namespaces, a cable between them, a token bucket at the agent's end.
+//! Real slow link: two network namespaces, a virtual link between them, a token bucket at the agent's end.
 //!
-//! The ego's host runs the router and the ego, the agent's host the agent alone; each is a process of this program.
+//! The ego's host runs the router and the ego, the agent's host only the agent; each is a process of this program.
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::process::{Child, Command, Stdio};
@@ -20,7 +20,7 @@ const AGENT: &str = "v2v-slow-agent";
 const EGO: &str = "v2v-slow-ego";
 const ROUTER: &str = "tcp/10.77.1.1:7447";
 
-/// One run over the cable.
+/// One run over the virtual link.
 pub(crate) fn over_cable(cell: &Cell, way: Way) -> Result<Seen> {
     let _cable = Cable::lay(cell.rate_mbps)?;
     let mut ego = start(EGO, way, cell)?;
@@ -28,7 +28,7 @@ pub(crate) fn over_cable(cell: &Cell, way: Way) -> Result<Seen> {
     let mut ready = String::new();
     from_ego.read_line(&mut ready)?;
     let agent = start(AGENT, way, cell)?.wait_with_output()?;
-    // The end of its input tells the ego that the agent is gone.
+    // The end of its input signals the end of the agent.
     drop(ego.stdin.take());
     let mut text = String::new();
     from_ego.read_to_string(&mut text)?;
@@ -49,7 +49,7 @@ fn start(host: &str, way: Way, cell: &Cell) -> Result<Child> {
     Ok(command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn()?)
 }
 
-/// What a process at one end does: prints what it saw.
+/// Runs the process of one end: prints its observations.
 pub(crate) fn run_end(arguments: &[String]) -> Result<()> {
     let [host, way, rate_mbps, bytes, seconds] = arguments else { bail!("end HOST WAY RATE BYTES SECONDS") };
     let cell = Cell::new(rate_mbps.parse()?, bytes.parse()?, Some(seconds.parse()?));
@@ -59,7 +59,7 @@ pub(crate) fn run_end(arguments: &[String]) -> Result<()> {
         (false, true) => {
             let session = plain_session("client")?;
             let offers = ends::send_plain(&session, &cell)?;
-            // Time for what lies in buffers.
+            // Time for the messages in buffers.
             thread::sleep(Duration::from_secs_f64((cell.on_the_wire_ms() / 1e3).min(20.0)));
             session.close().wait().map_err(anyhow::Error::from_boxed)?;
             Seen { offers, ..Seen::default() }
@@ -79,7 +79,7 @@ pub(crate) fn run_end(arguments: &[String]) -> Result<()> {
 fn ego() -> Result<Seen> {
     let _router = open(&BusOptions::router(Endpoint::new(ROUTER)?))?;
     let ego = ends::join(&Endpoint::new(ROUTER)?, "ego-9", "9")?;
-    say_ready()?;
+    print_ready()?;
     let arrivals = ends::receive(&ego, &ends::sent_topic())?;
     Ok(Seen { arrivals, ledger: ego.books().ledger(), ..Seen::default() })
 }
@@ -87,7 +87,7 @@ fn ego() -> Result<Seen> {
 fn plain_ego() -> Result<Seen> {
     let _router = plain_session("router")?;
     let session = plain_session("client")?;
-    say_ready()?;
+    print_ready()?;
     let is_over = Arc::new(AtomicBool::new(false));
     let over = Arc::clone(&is_over);
     thread::spawn(move || {
@@ -97,13 +97,13 @@ fn plain_ego() -> Result<Seen> {
     Ok(Seen { arrivals: ends::receive_plain(&session, || is_over.load(Ordering::Relaxed))?, ..Seen::default() })
 }
 
-fn say_ready() -> Result<()> {
+fn print_ready() -> Result<()> {
     let mut out = std::io::stdout();
     writeln!(out, "ready")?;
     Ok(out.flush()?)
 }
 
-/// zenoh as it comes, apart from where it meets and that it does so over TCP alone.
+/// zenoh with its default settings, except for endpoints and the restriction to TCP.
 fn plain_session(mode: &str) -> Result<Session> {
     let (listen, connect) = if mode == "router" { (vec![ROUTER], vec![]) } else { (vec![], vec![ROUTER]) };
     let mut config = Config::default();
@@ -119,12 +119,12 @@ fn plain_session(mode: &str) -> Result<Session> {
     zenoh::open(config).wait().map_err(anyhow::Error::from_boxed)
 }
 
-/// Two hosts and their cable; gone with this.
+/// Two hosts and their virtual link; removed when dropped.
 struct Cable;
 
 impl Cable {
     fn lay(rate_mbps: f64) -> Result<Self> {
-        // Left behind by one that was killed.
+        // Left behind by a run that was killed.
         drop(Self);
         let cable = Self;
         for host in [AGENT, EGO] {
@@ -136,7 +136,7 @@ impl Cable {
             ip(&format!("-n {host} address add {address} dev {end}"))?;
             ip(&format!("-n {host} link set {end} up"))?;
         }
-        // A queue of 50 ms, as routers have it; the burst is what a token bucket needs at 1 Gbit/s.
+        // A queue of 50 ms, as in routers; the burst is the size that a token bucket needs at 1 Gbit/s.
         let shape =
             format!("netns exec {AGENT} tc qdisc add dev slow1 root tbf rate {rate_mbps}mbit burst 64kb latency 50ms");
         ip(&shape)?;

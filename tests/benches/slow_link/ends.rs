@@ -1,4 +1,4 @@
-//! The two ends of a way: an agent that offers maps, an ego that takes them.
+//! Two ends of a connection: an agent that offers feature maps, an ego that receives them.
 
 use std::path::Path;
 use std::process::{Command, Stdio};
@@ -23,28 +23,28 @@ use zenoh::{Session, Wait};
 
 use super::{Cell, PERIOD};
 
-/// Without news for so long, nothing comes any more.
+/// Time without a message after which no more is expected.
 const SILENCE: Duration = Duration::from_secs(3);
 
-/// What both ends saw of a run.
+/// Observations of both ends of a run.
 #[derive(Debug, Default, Serialize, Deserialize)]
 pub(crate) struct Seen {
     pub(crate) offers: Vec<Offer>,
     pub(crate) arrivals: Vec<Arrived>,
-    /// Of all processes; empty where nobody keeps books.
+    /// Of all processes; empty without message accounting.
     pub(crate) ledger: Ledger,
 }
 
-/// A call of the publisher.
+/// One call of the publisher.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 pub(crate) struct Offer {
-    /// When it began; goes along as the capture time.
+    /// Start of the call; sent as the capture time.
     pub(crate) capture_nanos: u64,
-    /// How long it took.
+    /// Duration of the call.
     pub(crate) waited_nanos: u64,
 }
 
-/// A map in the ego's hands.
+/// One feature map received by the ego.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 pub(crate) struct Arrived {
     pub(crate) capture_nanos: u64,
@@ -52,7 +52,7 @@ pub(crate) struct Arrived {
     pub(crate) bytes: u64,
 }
 
-/// The agent's map.
+/// Topic of the agent's feature map.
 pub(crate) fn sent_topic() -> Topic {
     Topic::Stream { cav: cav("7"), stream: Stream::Bev }
 }
@@ -61,8 +61,8 @@ pub(crate) fn cav(text: &str) -> CavId {
     CavId::new(text).expect("an identifier")
 }
 
-/// Agent, link and ego over a router on loopback. It is a process of its own, as in a run: a router that waits for a receiver
-/// holds up a thread that all sessions of a process read with, the receiver's own among them.
+/// Agent, link and ego over a router on loopback. The router is a process of its own, as in a run: a router that waits
+/// for a receiver blocks a thread on which all sessions of a process read, the receiver's own among them.
 pub(crate) fn over_link(cell: &Cell) -> Result<Seen> {
     let endpoint = Endpoint::loopback(free_port());
     let mut router = Command::new(std::env::current_exe()?);
@@ -81,15 +81,15 @@ fn between(cell: &Cell, router: &Endpoint) -> Result<Seen> {
         queue: QueueConfig { keep_newest: true, ..QueueConfig::default() },
         ..LinkConfig::default()
     };
-    let air = LinkEmulator::new(config, Path::new("."), 1)?;
+    let emulator = LinkEmulator::new(config, Path::new("."), 1)?;
     let options = NodeOptions::new(cav("9"), vec![Stream::Bev]);
     let received = Topic::Received { ego: cav("9"), cav: cav("7"), stream: Stream::Bev };
     let stop = Stop::new();
     let (offers, arrivals) = thread::scope(|scope| {
-        let carrying = scope.spawn(|| link_node::run(&link, air, &options, &stop));
+        let carrying = scope.spawn(|| link_node::run(&link, emulator, &options, &stop));
         let receiving = scope.spawn(|| receive(&ego, &received));
         let offers = send(&agent, cell, &[(sent_topic(), "link-9"), (received.clone(), "ego-9")]);
-        // What is under way now is booked as such; nobody waits for it.
+        // Messages in flight are counted as such without waiting for them.
         stop.request();
         carrying.join().expect("no panic")?;
         anyhow::Ok((offers?, receiving.join().expect("no panic")?))
@@ -99,20 +99,20 @@ fn between(cell: &Cell, router: &Endpoint) -> Result<Seen> {
     Ok(Seen { offers, arrivals, ledger })
 }
 
-/// Routes until its input ends.
+/// Routes messages until its input ends.
 pub(crate) fn route(endpoint: &str) -> Result<()> {
     let _router = open(&BusOptions::router(Endpoint::new(endpoint)?))?;
     std::io::copy(&mut std::io::stdin(), &mut std::io::sink())?;
     Ok(())
 }
 
-/// A client in the run of this bench.
+/// A client in the run of this benchmark.
 pub(crate) fn join(router: &Endpoint, process: &str, cav: &str) -> Result<Bus> {
     let identity = Identity { run: RunId::new("slow-link")?, process: ProcessId::new(process)?, cav: self::cav(cav) };
     Ok(Bus::join(&BusOptions::client(router.clone()), identity)?)
 }
 
-/// Offers maps until the time is over, as an agent does, and waits until they are sent.
+/// Offers feature maps until the time is over, as an agent does, and waits until they are sent.
 pub(crate) fn send(agent: &Bus, cell: &Cell, routes: &[(Topic, &str)]) -> Result<Vec<Offer>> {
     let presence = agent.announce(Role::Agent)?;
     let publisher = agent.publisher(sent_topic(), PublisherOptions::FEATURES)?;
@@ -134,7 +134,7 @@ pub(crate) fn send(agent: &Bus, cell: &Cell, routes: &[(Topic, &str)]) -> Result
     Ok(offers)
 }
 
-/// Takes maps, decodes them, and notes when that was done.
+/// Receives feature maps, decodes them, and records the times.
 pub(crate) fn receive(ego: &Bus, topic: &Topic) -> Result<Vec<Arrived>> {
     let inbox = ego.inbox(64, 1);
     let _subscription = ego.subscribe(topic.clone(), &inbox)?;
@@ -151,7 +151,7 @@ pub(crate) fn receive(ego: &Bus, topic: &Topic) -> Result<Vec<Arrived>> {
 
 const PLAIN_KEY: &str = "v2v/plain";
 
-/// The same with zenoh alone: the capture time and zeros.
+/// The same with bare zenoh: the capture time and zeros.
 pub(crate) fn send_plain(session: &Session, cell: &Cell) -> Result<Vec<Offer>> {
     let publisher = session.declare_publisher(PLAIN_KEY).wait().map_err(anyhow::Error::from_boxed)?;
     tests::bus::wait_for("a route", || publisher.matching_status().wait().is_ok_and(|status| status.matching()));
@@ -161,7 +161,7 @@ pub(crate) fn send_plain(session: &Session, cell: &Cell) -> Result<Vec<Offer>> {
         || vec![0_u8; bytes],
         |capture_nanos, mut map| {
             map[..8].copy_from_slice(&capture_nanos.to_le_bytes());
-            // It says Ok also of what it drops.
+            // It returns Ok also for messages that it drops.
             if let Err(cause) = publisher.put(ZBytes::from(map)).wait() {
                 eprintln!("zenoh refuses a message: {cause}");
             }
@@ -170,16 +170,16 @@ pub(crate) fn send_plain(session: &Session, cell: &Cell) -> Result<Vec<Offer>> {
     Ok(offers)
 }
 
-/// Takes what comes until `is_over` and nothing has come for a while.
+/// Receives messages until `is_over` and none has come for a while.
 pub(crate) fn receive_plain(session: &Session, is_over: impl Fn() -> bool) -> Result<Vec<Arrived>> {
     let arrivals = std::sync::Arc::new(Mutex::new(Vec::new()));
-    let heard = std::sync::Arc::clone(&arrivals);
+    let collected = std::sync::Arc::clone(&arrivals);
     let subscriber = session.declare_subscriber(PLAIN_KEY).callback(move |sample| {
         let nanos = unix_nanos();
         let payload = sample.payload().to_bytes();
         let Some(capture) = payload.first_chunk() else { return };
         let arrived = Arrived { capture_nanos: u64::from_le_bytes(*capture), nanos, bytes: payload.len() as u64 };
-        heard.lock().expect("no panic").push(arrived);
+        collected.lock().expect("no panic").push(arrived);
     });
     let _subscriber = subscriber.wait().map_err(anyhow::Error::from_boxed)?;
     let (mut count, mut since) = (0, Instant::now());
@@ -194,7 +194,7 @@ pub(crate) fn receive_plain(session: &Session, is_over: impl Fn() -> bool) -> Re
     Ok(arrivals)
 }
 
-/// Calls `offer` at the rate of a LiDAR, with a map made before its time.
+/// Calls `offer` at the rate of a LiDAR, with a feature map made before.
 fn at_10_hz<M>(cell: &Cell, make: impl Fn() -> M, mut offer: impl FnMut(u64, M)) -> Vec<Offer> {
     let began = Instant::now();
     let count = (cell.duration.as_secs_f64() / PERIOD.as_secs_f64()).round() as u32;
@@ -208,7 +208,7 @@ fn at_10_hz<M>(cell: &Cell, make: impl Fn() -> M, mut offer: impl FnMut(u64, M))
     ticks.collect()
 }
 
-/// A map of `bytes`: 64 channels of f32.
+/// A feature map of `bytes`: 64 channels of f32.
 fn features(bytes: usize) -> BevFeatures {
     let (channels, cells) = (64, bytes / 4 / 64);
     let width = cells.isqrt().next_power_of_two();

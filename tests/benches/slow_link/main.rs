@@ -1,11 +1,12 @@
-//! Maps over slow links: how old the newest one is, what is lost and why, how long the caller that publishes waits.
+//! Benchmark of feature maps over slow links: age of the newest one, losses and their reasons, blocking time of the
+//! publisher.
 //!
-//! An agent offers a map at 10 Hz. Three ways to the ego take turns for every rate and size:
+//! An agent offers a feature map at 10 Hz. Three connections to the ego take turns for every rate and size:
 //!
-//! - `link`: the bus, with the emulated link of `sim-replay link` between (the queue keeps the newest);
-//! - `cable`: the bus over a real slow link, two network namespaces whose cable is shaped by a token bucket
-//!   (`tc qdisc add .. tbf`);
-//! - `plain`: zenoh over the same cable with the settings it comes with.
+//! - `link`: the bus, with the emulated link of `sim-replay link` between (KEEP_LAST(1) queue);
+//! - `cable`: the bus over a real slow link, two network namespaces whose virtual link is shaped by a token bucket (`tc
+//! qdisc add .. tbf`);
+//! - `plain`: zenoh over the same virtual link with its default settings.
 //!
 //! ```text
 //! cargo bench -p tests --bench slow_link -- --out deploy/results/link             # everything, 20 minutes
@@ -14,10 +15,10 @@
 //! ```
 //!
 //! The namespaces need root and iproute2; without them only `link` can run. A run lasts ten seconds, or two and a half
-//! times what one message takes on the wire where that is longer, so that the age of the newest map goes through its
-//! whole saw tooth. Writes `slow_link.csv` and `slow_link.md`. Fails when a run of `link` misses a target: no message
-//! lost without a reason, no call of the publisher longer than 5 ms, 95th percentile of the age of the newest map, at
-//! every millisecond from the first arrival on, below twice the time on the wire and 100 ms.
+//! times the transmission time of a message where that is longer, so that the age of the newest feature map goes
+//! through its whole saw tooth. Writes `slow_link.csv` and `slow_link.md`. Fails when a run of `link` misses a target:
+//! no message lost without a reason, no call of the publisher longer than 5 ms, 95th percentile of the age of the
+//! newest feature map, at every millisecond from the first arrival on, below twice the transmission time and 100 ms.
 
 mod cable;
 mod ends;
@@ -32,10 +33,10 @@ use table::Row;
 
 const RATES_MBPS: [f64; 5] = [1.0, 6.0, 27.0, 100.0, 1000.0];
 const SIZES: [usize; 3] = [64 << 10, 1 << 20, 8 << 20];
-/// Between two maps.
+/// Time between two feature maps.
 const PERIOD: Duration = Duration::from_millis(100);
 
-/// How maps come from the agent to the ego.
+/// Connection from the agent to the ego.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Way {
     Link,
@@ -71,18 +72,18 @@ impl Cell {
         cell
     }
 
-    /// What one message takes on the wire.
+    /// Transmission time of a message, milliseconds.
     fn on_the_wire_ms(&self) -> f64 {
         self.bytes as f64 * 8.0 / (self.rate_mbps * 1e3)
     }
 
-    /// The age that the newest map may have.
+    /// Largest age of the newest feature map, milliseconds.
     fn age_target_ms(&self) -> f64 {
         2.0 * self.on_the_wire_ms() + PERIOD.as_secs_f64() * 1e3
     }
 }
 
-/// What is asked for.
+/// Options of the benchmark.
 struct Wanted {
     out: PathBuf,
     ways: Vec<Way>,
@@ -116,7 +117,7 @@ fn wanted(arguments: &[String]) -> Result<Wanted> {
         }
     }
     if wanted.out == PathBuf::new() {
-        bail!("--out DIR says where the table goes");
+        bail!("--out DIR is required: the folder of the table");
     }
     Ok(wanted)
 }

@@ -1,4 +1,4 @@
-//! What a run comes to.
+//! Table of the results, one row per run.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -13,7 +13,7 @@ use tests::machine;
 use super::ends::Seen;
 use super::{Cell, Way};
 
-/// How long the caller may wait for a publisher, milliseconds.
+/// Longest time that a publisher may block its caller, milliseconds.
 const OFFER_TARGET_MS: f64 = 5.0;
 
 /// One line of the table. Times in milliseconds.
@@ -24,7 +24,7 @@ pub(crate) struct Row {
     seconds: f64,
     offered: usize,
     arrived: usize,
-    /// By reason, and how many nobody can tell of.
+    /// By reason, and the number of unexplained losses.
     dropped: BTreeMap<DropReason, u64>,
     unexplained: i64,
     offer_max_ms: f64,
@@ -43,7 +43,7 @@ impl Row {
         let on_the_way: u64 =
             seen.ledger.iter().filter(|(account, _)| account.to.is_none()).map(|(_, c)| c.in_flight).sum();
         let unexplained = if seen.ledger.is_empty() {
-            // zenoh tells nobody what it drops.
+            // zenoh reports no drops.
             seen.offers.len() as i64 - seen.arrivals.len() as i64
         } else if seen.ledger.balance().is_exact() {
             on_the_way as i64
@@ -68,7 +68,7 @@ impl Row {
         }
     }
 
-    /// Whether nothing is missing, nobody waited and the newest map is new enough.
+    /// True if no message is missing, no call blocked and the newest feature map is new enough.
     pub(crate) fn is_on_target(&self) -> bool {
         self.unexplained == 0 && self.offer_max_ms <= OFFER_TARGET_MS && self.age_p95_ms <= self.age_target_ms
     }
@@ -103,8 +103,8 @@ impl Row {
 
     fn csv(&self) -> String {
         let dropped = |reason| self.dropped.get(&reason).copied().unwrap_or(0);
-        let in_books = |reason: &&DropReason| ![DropReason::Superseded, DropReason::Stale].contains(reason);
-        let other: u64 = self.dropped.keys().filter(in_books).map(|reason| dropped(*reason)).sum();
+        let is_own_column = |reason: &&DropReason| ![DropReason::Superseded, DropReason::Stale].contains(reason);
+        let other: u64 = self.dropped.keys().filter(is_own_column).map(|reason| dropped(*reason)).sum();
         format!(
             "{},{},{},{:.1},{},{},{},{},{},{},{:.3},{:.1},{:.1},{:.1},{:.1},{:.3},{}",
             self.way,
@@ -150,7 +150,7 @@ pub(crate) fn write(folder: &Path, arguments: &str, rows: &[Row]) -> Result<()> 
     Ok(())
 }
 
-/// The age of the newest map at every millisecond from the first arrival to the last offer.
+/// Age of the newest feature map at every millisecond from the first arrival to the last offer.
 fn ages_ms(seen: &Seen) -> Vec<f64> {
     let end_nanos = seen.offers.last().map_or(0, |offer| offer.capture_nanos);
     let mut arrivals = seen.arrivals.iter().peekable();
@@ -179,7 +179,7 @@ fn millis(from_nanos: u64, to_nanos: u64) -> f64 {
     (to_nanos as f64 - from_nanos as f64) / 1e6
 }
 
-/// Not a number where there are no values: nothing is on target then.
+/// NaN without values: no target holds then.
 fn quantile(values: &[f64], quantile: f64) -> f64 {
     statistics::quantile(&statistics::sorted(values), quantile).unwrap_or(f64::NAN)
 }

@@ -1,4 +1,4 @@
-//! What a fleet under faults has to keep to, found out from what it told.
+//! Requirements on a fleet under faults, checked on its results.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -7,22 +7,22 @@ use std::path::{Path, PathBuf};
 
 use serde_json::Value;
 
-/// A result of the ego, as far as it matters here.
+/// Fields of an ego's result that the checks need.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Result {
-    /// Which life of the ego.
+    /// Epoch of the ego's instance.
     pub epoch: u64,
-    /// When it was published, milliseconds on the Unix clock.
+    /// Time of publication, milliseconds on the Unix clock.
     pub published_ms: u64,
-    /// Whose data are in it.
+    /// Vehicles whose data are in it.
     pub fused: Vec<String>,
 }
 
-/// The results of a run, read as they are written.
+/// Results of a run, read while they are written.
 #[derive(Debug)]
 pub struct Results {
     file: PathBuf,
-    /// Bytes of whole lines that were read.
+    /// Bytes of complete lines that were read.
     read: u64,
     all: Vec<Result>,
 }
@@ -38,7 +38,7 @@ impl Results {
     pub fn update(&mut self) -> &[Result] {
         let mut text = Vec::new();
         if let Ok(mut file) = File::open(&self.file) {
-            // A line that is not whole yet is read again next time.
+            // An incomplete line is read again next time.
             let _ = file.seek(SeekFrom::Start(self.read)).and_then(|_| file.read_to_end(&mut text));
         }
         let whole = text.iter().rposition(|byte| *byte == b'\n').map_or(0, |end| end + 1);
@@ -55,19 +55,19 @@ fn read(line: &Value) -> Option<Result> {
     Some(Result { epoch, published_ms, fused: fused.collect() })
 }
 
-/// What came of many faults.
+/// Findings over many faults.
 #[derive(Debug, Clone, Default)]
 pub struct Findings {
-    /// Longest time between two results of one life of the ego while nothing was done to what it lives on, milliseconds.
+    /// Longest time between two results of one instance of the ego while no fault affected its inputs, milliseconds.
     pub longest_gap_ms: u64,
-    /// Those of them that were above two periods, milliseconds, and what was done meanwhile.
+    /// Those above two periods, milliseconds, and the fault at that time.
     pub gaps: Vec<(u64, String)>,
-    /// From the first message of a vehicle's new life to the first result with its data in it, milliseconds.
+    /// From the first message of a restarted vehicle to the first result with its data, milliseconds.
     pub fused_again_ms: Vec<u64>,
 }
 
 impl Findings {
-    /// Takes in the results between `from_ms` and `to_ms`, while `what` was done.
+    /// Adds the gaps between the results from `from_ms` to `to_ms`, during the fault `what`.
     pub fn add_gaps(&mut self, results: &[Result], [from_ms, to_ms]: [u64; 2], period_ms: u64, what: &str) {
         let within = |result: &&Result| (from_ms..=to_ms).contains(&result.published_ms);
         let results: Vec<&Result> = results.iter().filter(within).collect();
@@ -80,13 +80,13 @@ impl Findings {
         }
     }
 
-    /// Takes in when vehicles were first heard in a new life, by vehicle.
-    pub fn add_returns(&mut self, results: &[Result], first_heard_ms: &BTreeMap<String, u64>) {
-        for (cav, heard_ms) in first_heard_ms {
+    /// Adds the times of the first message of restarted vehicles, by vehicle.
+    pub fn add_returns(&mut self, results: &[Result], first_message_ms: &BTreeMap<String, u64>) {
+        for (cav, message_ms) in first_message_ms {
             let fused = results
                 .iter()
-                .find(|result| result.published_ms >= *heard_ms && result.fused.contains(cav))
-                .map(|result| result.published_ms - heard_ms);
+                .find(|result| result.published_ms >= *message_ms && result.fused.contains(cav))
+                .map(|result| result.published_ms - message_ms);
             self.fused_again_ms.push(fused.unwrap_or(u64::MAX));
         }
     }
@@ -101,7 +101,7 @@ mod tests {
     }
 
     #[test]
-    fn gaps_count_within_one_life() {
+    fn gaps_count_within_one_instance() {
         let results =
             [result(1, 0, &[]), result(1, 100, &[]), result(1, 350, &[]), result(2, 900, &[]), result(2, 1000, &[])];
         let mut findings = Findings::default();

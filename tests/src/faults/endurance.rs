@@ -1,4 +1,4 @@
-//! RunScope that are started and ended again and again, and runs that last.
+//! Repeated starts and ends of a fleet, and long runs.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -10,15 +10,15 @@ use deploy::operate::status::RunStatus;
 use super::{Results, VEHICLES, unix_ms};
 use crate::fleet::{Up, signal, write_weights};
 
-/// How often memory is looked at.
-const LOOK: Duration = Duration::from_secs(5);
-/// Share of a run that is warm-up.
+/// Interval between two readings of memory.
+const READING_PERIOD: Duration = Duration::from_secs(5);
+/// Fraction of a run that is warm-up.
 const WARM_UP: f64 = 0.2;
 
 /// Writes a scene of [`VEHICLES`], weights and a scenario into `folder`; `rest` are further lines of the scenario.
 ///
 /// # Panics
-/// When the disk refuses.
+/// When a file cannot be written.
 #[must_use]
 pub fn write_scenario(folder: &Path, rest: &str) -> PathBuf {
     crate::scene::write(folder, &VEHICLES, 10);
@@ -35,25 +35,25 @@ pub fn write_scenario(folder: &Path, rest: &str) -> PathBuf {
 /// One start and its end.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ColdStart {
-    /// From the call of `v2vloc up` to the first result with data of all neighbours, milliseconds.
+    /// From the start of `v2vloc up` to the first result with data of all neighbours, milliseconds.
     pub first_fused_ms: u64,
-    /// Frames of the ego's agent before that one that were never decided.
+    /// Number of frames of the ego's agent before that one that were never decided.
     pub lost_before: u64,
     /// From Ctrl-C to the end of `v2vloc up`.
     pub stop: Duration,
-    /// Processes that had to be killed for it, or stayed.
+    /// Number of processes that had to be killed, or that remained.
     pub left: usize,
 }
 
-/// Starts a fleet of [`VEHICLES`] with nothing running, waits until all are fused for a moment, and ends it. One that is
-/// secured makes its keys first, and speaks QUIC.
+/// Starts a fleet of [`VEHICLES`] with nothing running, waits until all are fused for a moment, and ends it. A secured
+/// fleet makes its keys first, and speaks QUIC.
 ///
 /// # Panics
-/// When it does not come that far.
+/// When it does not reach that state.
 #[must_use]
 pub fn cold_start(folder: &Path, is_secured: bool) -> ColdStart {
     let scenario = write_scenario(folder, if is_secured { "security: {}" } else { "" });
-    // Built before the clock runs: looking for what there is to build takes seconds.
+    // Built before the clock runs: the check for changes takes seconds.
     crate::fleet::programs();
     let began_ms = unix_ms();
     let mut up = Up::start(folder, &scenario);
@@ -72,10 +72,10 @@ pub fn cold_start(folder: &Path, is_secured: bool) -> ColdStart {
     ColdStart { first_fused_ms: published_ms - began_ms, lost_before: index - first as u64, stop, left }
 }
 
-/// What a long run says.
+/// Measurements of a long run.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Soak {
-    /// Results.
+    /// Number of results.
     pub frames: usize,
     /// Resident memory of each process: MiB after the warm-up, MiB at the end, MiB a minute in between.
     pub memory: Vec<(String, [f64; 3])>,
@@ -83,32 +83,32 @@ pub struct Soak {
     pub p99_ms: [f64; 2],
     /// Descriptors and threads of each process, after the warm-up and at the end.
     pub handles: Vec<(String, [u64; 4])>,
-    /// Whether the ledger balances.
+    /// True if the ledger balances.
     pub balances: bool,
 }
 
-/// RunScope a fleet of [`VEHICLES`] at 10 Hz for so long; `told` hears of every look.
+/// Runs a fleet of [`VEHICLES`] at 10 Hz for so long; `on_reading` is called with every reading.
 ///
 /// # Panics
-/// When a process falls.
+/// When a process crashes.
 #[must_use]
-pub fn soak(folder: &Path, lasts: Duration, mut told: impl FnMut(Duration, &[(String, Usage)])) -> Soak {
+pub fn soak(folder: &Path, lasts: Duration, mut on_reading: impl FnMut(Duration, &[(String, Usage)])) -> Soak {
     let scenario = write_scenario(folder, "link: {model: ideal}");
     let mut up = Up::start(folder, &scenario);
     let mut results = Results::of(&up.folder);
     up.wait_for_results("a result", |results| !results.is_empty());
     let (began, began_ms) = (Instant::now(), unix_ms());
-    let mut looks: Vec<(f64, Vec<(String, Usage)>)> = Vec::new();
+    let mut readings: Vec<(f64, Vec<(String, Usage)>)> = Vec::new();
     while began.elapsed() < lasts {
-        std::thread::sleep(LOOK.min(lasts / 20));
+        std::thread::sleep(READING_PERIOD.min(lasts / 20));
         let own = [("v2vloc".to_owned(), up.pid())];
         let usage_of = |(name, pid)| Usage::of(pid).map(|usage| (name, usage));
         let usage: Vec<(String, Usage)> = up.pids().into_iter().chain(own).filter_map(usage_of).collect();
-        let status = RunStatus::read(&up.folder).expect("a run tells how it goes");
-        let fallen = status.processes.iter().find(|process| process.state == State::Down || process.restarts > 0);
-        assert!(fallen.is_none(), "{fallen:?}");
-        told(began.elapsed(), &usage);
-        looks.push((began.elapsed().as_secs_f64() / 60.0, usage));
+        let status = RunStatus::read(&up.folder).expect("a run writes its status");
+        let crashed = status.processes.iter().find(|process| process.state == State::Down || process.restarts > 0);
+        assert!(crashed.is_none(), "{crashed:?}");
+        on_reading(began.elapsed(), &usage);
+        readings.push((began.elapsed().as_secs_f64() / 60.0, usage));
     }
     signal(up.pid(), "INT");
     up.wait();
@@ -126,7 +126,7 @@ pub fn soak(folder: &Path, lasts: Duration, mut told: impl FnMut(Duration, &[(St
     let ledger = fs::read_to_string(up.folder.join("ledger.json")).expect("a ledger");
     let ledger: serde_json::Value = serde_json::from_str(&ledger).expect("JSON");
     let warm: Vec<_> =
-        looks.into_iter().filter(|(minutes, _)| *minutes * 60.0 > WARM_UP * lasts.as_secs_f64()).collect();
+        readings.into_iter().filter(|(minutes, _)| *minutes * 60.0 > WARM_UP * lasts.as_secs_f64()).collect();
     Soak {
         frames,
         memory: each(&warm, |usage| usage.resident_mib)
@@ -152,24 +152,24 @@ pub fn soak(folder: &Path, lasts: Duration, mut told: impl FnMut(Duration, &[(St
 
 /// A value of each process over time, minutes.
 fn each(
-    looks: &[(f64, Vec<(String, Usage)>)],
+    readings: &[(f64, Vec<(String, Usage)>)],
     value: impl Fn(&Usage) -> Option<f64>,
 ) -> Vec<(String, Vec<(f64, f64)>)> {
-    let names = looks.first().into_iter().flat_map(|(_, usage)| usage.iter().map(|(name, _)| name.clone()));
+    let names = readings.first().into_iter().flat_map(|(_, usage)| usage.iter().map(|(name, _)| name.clone()));
     names
         .map(|name| {
             let at = |(minutes, usage): &(f64, Vec<(String, Usage)>)| {
                 let (_, usage) = usage.iter().find(|(known, _)| *known == name)?;
                 Some((*minutes, value(usage)?))
             };
-            let points = looks.iter().filter_map(at).collect();
+            let points = readings.iter().filter_map(at).collect();
             (name, points)
         })
         .filter(|(_, points): &(String, Vec<_>)| !points.is_empty())
         .collect()
 }
 
-/// Latency and moment of each result, from `frames.csv`; its lines are those of the results.
+/// Latency and time of each result, from `frames.csv`; its lines are those of the results.
 fn latencies(table: &str, published_ms: &[u64]) -> Vec<(u64, f64)> {
     let latency = |line: &str| line.split(',').nth(3)?.parse().ok();
     published_ms.iter().copied().zip(table.lines().skip(1).filter_map(latency)).collect()

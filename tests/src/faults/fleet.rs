@@ -1,4 +1,4 @@
-//! A fleet that faults are done to: `v2vloc up` on a small scene, over cables that can be cut.
+//! Fleet under faults: `v2vloc up` on a small scene, over virtual links that can be cut.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -16,19 +16,19 @@ use super::{Fault, Findings, Kind, Proxy, Results, Target, VEHICLES, unix_ms, wr
 use crate::bus::{free_port, wait_for};
 use crate::fleet::{Up, signal};
 
-/// Between two ticks of the scene.
+/// Time between two ticks of the scene.
 const PERIOD_MS: u64 = 100;
-/// Results in a row with everyone's data in them, after which all is as before.
+/// Number of results in a row with every vehicle's data, after which the fleet has recovered.
 const SETTLED: usize = 5;
-/// Longest that a fleet may take for that.
+/// Longest time until then.
 const PATIENCE: Duration = Duration::from_secs(60);
-/// How long the router waits for a receiver that takes nothing.
+/// Longest time that the router waits for a receiver that reads nothing.
 const STALL: Duration = Duration::from_millis(50);
-/// A process that lives this long has opened what it opens.
-const GROWN_UP: Duration = Duration::from_secs(5);
+/// Age at which a process has opened all its descriptors.
+const SETTLED_AGE: Duration = Duration::from_secs(5);
 
-/// When vehicles were first heard, by vehicle and life, milliseconds on the Unix clock.
-type FirstHeard = BTreeMap<(String, u64), u64>;
+/// Time of the first message, by vehicle and epoch, milliseconds on the Unix clock.
+type FirstMessages = BTreeMap<(String, u64), u64>;
 
 /// A fleet under faults.
 pub struct FaultyFleet {
@@ -36,35 +36,35 @@ pub struct FaultyFleet {
     proxy: Proxy,
     router: Option<Session>,
     router_endpoint: Endpoint,
-    heard: Arc<Mutex<FirstHeard>>,
+    first_messages: Arc<Mutex<FirstMessages>>,
     _observer: Session,
     results: Results,
     shared_memory: BTreeSet<String>,
-    /// First and last usage of each life of a process that has grown up.
+    /// First and last usage of each process instance above that age.
     usage: BTreeMap<u32, (String, Instant, Option<[Usage; 2]>)>,
     findings: Findings,
 }
 
-/// What came of it.
+/// Results of the faults.
 #[derive(Debug)]
 pub struct Report {
     /// Gaps and returns.
     pub findings: Findings,
-    /// Longest from the end of a fault until all was as before, milliseconds, and what the fault was.
+    /// Longest time from the end of a fault to recovery, milliseconds, and the fault.
     pub slowest: (u64, String),
-    /// Whether the ledgers of all processes add up.
+    /// True if the ledgers of all processes balance.
     pub balances: bool,
-    /// What they do not add up by.
+    /// Description of the discrepancies.
     pub differences: String,
-    /// Messages of which nobody can tell what became of them, as one they concern was away.
+    /// Number of messages that are exempt, as a process that they concern was offline.
     pub exempted: u64,
     /// From Ctrl-C to the end.
     pub stop: Duration,
-    /// Files in shared memory that were not there before.
+    /// Files in shared memory that did not exist before.
     pub left_over: Vec<String>,
-    /// Largest growth of descriptors and of threads in any life of any process, with its name.
+    /// Largest growth of descriptors and of threads in any instance of a process, with its name.
     pub growth: [(i64, String); 2],
-    /// Processes that were started again.
+    /// Number of restarts.
     pub restarts: u64,
 }
 
@@ -72,7 +72,7 @@ impl FaultyFleet {
     /// Starts a fleet of [`VEHICLES`] in `folder` and waits until all are fused.
     ///
     /// # Panics
-    /// When it does not come that far.
+    /// When it does not reach that state.
     #[must_use]
     pub fn start(folder: &Path) -> Self {
         let shared_memory = shared_memory();
@@ -80,8 +80,8 @@ impl FaultyFleet {
         let router_endpoint = Endpoint::loopback(port);
         let router = route(&router_endpoint).expect("a router");
         let proxy = Proxy::open(port);
-        let heard = Arc::<Mutex<FirstHeard>>::default();
-        let observer = observe(&router_endpoint, &heard);
+        let first_messages = Arc::<Mutex<FirstMessages>>::default();
+        let observer = observe(&router_endpoint, &first_messages);
         let rest = format!(
             "network: {{connect: {}}}\nlink: {{model: ideal}}\ntimeouts: {{restarts: 1000000}}",
             proxy.endpoint.as_str()
@@ -94,7 +94,7 @@ impl FaultyFleet {
             proxy,
             router: Some(router),
             router_endpoint,
-            heard,
+            first_messages,
             _observer: observer,
             results,
             shared_memory,
@@ -105,12 +105,12 @@ impl FaultyFleet {
         fleet
     }
 
-    /// Does one fault after another, each when all is as before.
+    /// Injects one fault after another, each after recovery from the previous one.
     ///
     /// # Panics
-    /// When a fault is never got over.
+    /// When the fleet does not recover.
     #[must_use]
-    pub fn suffer(mut self, faults: &[Fault], mut told: impl FnMut(usize, &Fault, u64)) -> Report {
+    pub fn suffer(mut self, faults: &[Fault], mut on_recovery: impl FnMut(usize, &Fault, u64)) -> Report {
         let mut slowest = (0, String::new());
         let mut settled_ms = unix_ms();
         for (number, fault) in faults.iter().enumerate() {
@@ -134,13 +134,13 @@ impl FaultyFleet {
             if !fault.silences_ego() {
                 self.findings.add_gaps(results, [settled_ms, now_ms], PERIOD_MS, &fault.to_string());
             }
-            let heard = self.heard.lock().unwrap_or_else(PoisonError::into_inner);
-            let new = heard.iter().filter(|((cav, _), at)| **at >= began_ms && cav != VEHICLES[0]);
+            let first_messages = self.first_messages.lock().unwrap_or_else(PoisonError::into_inner);
+            let new = first_messages.iter().filter(|((cav, _), at)| **at >= began_ms && cav != VEHICLES[0]);
             let new: BTreeMap<String, u64> = new.map(|((cav, _), at)| (cav.clone(), *at)).collect();
             self.findings.add_returns(results, &new);
-            drop(heard);
-            self.look_at_usage();
-            told(number, fault, now_ms - ended_ms);
+            drop(first_messages);
+            self.read_usage();
+            on_recovery(number, fault, now_ms - ended_ms);
             settled_ms = now_ms;
         }
         self.end(slowest)
@@ -149,7 +149,7 @@ impl FaultyFleet {
     fn act(&mut self, fault: &Fault, pids: &BTreeMap<String, u32>) {
         let Target::Process(name) = &fault.target else {
             let router = self.router.take().expect("it is there");
-            // It does not matter how it goes.
+            // The result does not matter.
             let _ = router.close().wait();
             thread::sleep(fault.lasts);
             let endpoint = self.router_endpoint.clone();
@@ -177,13 +177,13 @@ impl FaultyFleet {
         }
     }
 
-    /// Waits until results published after `after_ms` have everyone's data in them again; `gone` is a process that has to
-    /// be there anew, with its id of before.
+    /// Waits until results published after `after_ms` have every vehicle's data again; `gone` is a process that has to
+    /// be restarted, with its previous id.
     fn settle(&mut self, after_ms: u64, gone: Option<(&str, u32)>, what: &str) -> std::result::Result<(), String> {
         let deadline = Instant::now() + PATIENCE;
         loop {
             let is_back = gone.is_none_or(|(name, pid)| self.up.pids().get(name).is_some_and(|now| *now != pid));
-            // A map of the earlier life may still be young enough for a while.
+            // A feature map of the previous instance may be recent enough for a while.
             let after_ms = match gone {
                 Some((name, _)) => name.strip_prefix("agent-").map_or(Some(after_ms), |cav| self.back(cav, after_ms)),
                 None => Some(after_ms),
@@ -203,18 +203,18 @@ impl FaultyFleet {
         }
     }
 
-    /// When a vehicle was heard for the first time in a life that began after `after_ms`.
+    /// Time of the first message of a vehicle's instance that began after `after_ms`.
     fn back(&self, cav: &str, after_ms: u64) -> Option<u64> {
-        let heard = self.heard.lock().unwrap_or_else(PoisonError::into_inner);
-        heard.iter().filter(|((known, _), at)| known == cav && **at >= after_ms).map(|(_, at)| *at).max()
+        let first_messages = self.first_messages.lock().unwrap_or_else(PoisonError::into_inner);
+        first_messages.iter().filter(|((known, _), at)| known == cav && **at >= after_ms).map(|(_, at)| *at).max()
     }
 
-    fn look_at_usage(&mut self) {
+    fn read_usage(&mut self) {
         let now = Instant::now();
         let own = [("v2vloc".to_owned(), self.up.pid())];
         for (name, pid) in self.up.pids().into_iter().chain(own) {
             let (_, since, usage) = self.usage.entry(pid).or_insert((name, now, None));
-            if let Some(found) = Usage::of(pid).filter(|_| now.duration_since(*since) >= GROWN_UP) {
+            if let Some(found) = Usage::of(pid).filter(|_| now.duration_since(*since) >= SETTLED_AGE) {
                 usage.get_or_insert([found; 2])[1] = found;
             }
         }
@@ -250,22 +250,22 @@ impl FaultyFleet {
     }
 }
 
-/// A router that gives a receiver up before the others have missed two periods.
+/// A router that disconnects a stalled receiver before the others have missed two periods.
 fn route(endpoint: &Endpoint) -> std::result::Result<Session, BusError> {
     open(&BusOptions { stall_limit: STALL, ..BusOptions::router(endpoint.clone()) })
 }
 
-/// Hears every vehicle's pose, and notes when a new life of it began to speak.
-fn observe(router: &Endpoint, heard: &Arc<Mutex<FirstHeard>>) -> Session {
+/// Subscribes to every vehicle's pose, and records the first message of each instance.
+fn observe(router: &Endpoint, first_messages: &Arc<Mutex<FirstMessages>>) -> Session {
     let session = open(&BusOptions::client(router.clone())).expect("the router is there");
-    let heard = Arc::clone(heard);
+    let first_messages = Arc::clone(first_messages);
     let subscriber = session.declare_subscriber("v2v/test/*/pose").callback(move |sample| {
         let bytes = sample.payload().to_bytes();
         let header =
             bytes.get(..HEADER_LEN).and_then(|bytes| protocol::Header::from_bytes(bytes.try_into().ok()?).ok());
         if let Some(stamp) = header.map(|header| header.stamp) {
-            let mut heard = heard.lock().unwrap_or_else(PoisonError::into_inner);
-            heard.entry((stamp.cav.to_string(), stamp.epoch)).or_insert(stamp.publish_nanos / 1_000_000);
+            let mut first_messages = first_messages.lock().unwrap_or_else(PoisonError::into_inner);
+            first_messages.entry((stamp.cav.to_string(), stamp.epoch)).or_insert(stamp.publish_nanos / 1_000_000);
         }
     });
     subscriber.background().wait().expect("a subscriber");

@@ -1,5 +1,5 @@
-//! Faults of a running fleet: processes killed, stopped and ended, cables cut and silent, the router gone. Which, when and
-//! how long comes from a seed.
+//! Faults of a running fleet: processes killed, stopped and ended, virtual links cut and silent, the router gone. Kind,
+//! time and duration come from a seed.
 
 mod check;
 mod endurance;
@@ -23,7 +23,7 @@ fn unix_ms() -> u64 {
     bus::unix_nanos() / 1_000_000
 }
 
-/// What is done.
+/// Kind of a fault.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Kind {
     /// `kill -9`.
@@ -34,34 +34,34 @@ pub enum Kind {
     Stop,
     /// The connection is cut; the process may connect again at once.
     Cut,
-    /// Nothing comes through for a while, and no end of the connection is told.
+    /// Nothing is transmitted for a while, but the connection stays open.
     Silence,
 }
 
-/// To whom.
+/// Target of a fault.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Target {
     /// A process, by its name.
     Process(String),
-    /// The router that all meet at: gone, and there again after a while.
+    /// The router of the run: gone, and restarted after a while.
     Router,
 }
 
 /// One fault.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Fault {
-    /// What.
+    /// Kind of the fault.
     pub kind: Kind,
-    /// To whom.
+    /// Its target.
     pub target: Target,
-    /// How long it lasts, where it lasts.
+    /// Its duration, for kinds with one.
     pub lasts: Duration,
-    /// After everything is as before, until the fault.
+    /// Time from recovery to the fault.
     pub after: Duration,
 }
 
 impl Fault {
-    /// Whether nothing can be expected of the ego meanwhile: what it lives on is hit, or the way to whoever listens.
+    /// True if no results can be expected of the ego meanwhile: its inputs are hit, or the connection to the scorer.
     #[must_use]
     pub fn silences_ego(&self) -> bool {
         let own = [format!("agent-{}", VEHICLES[0]), format!("ego-{}", VEHICLES[0]), "replay".into()];
@@ -81,7 +81,7 @@ impl fmt::Display for Fault {
             Kind::End => write!(f, "{target} ended"),
             Kind::Stop => write!(f, "{target} stopped for {seconds:.1} s"),
             Kind::Cut => write!(f, "{target} cut off"),
-            Kind::Silence => write!(f, "{target} not heard for {seconds:.1} s"),
+            Kind::Silence => write!(f, "{target} silent for {seconds:.1} s"),
         }
     }
 }
@@ -100,7 +100,7 @@ pub fn plan(seed: u64, count: usize) -> Vec<Fault> {
         let Some(name) = targets.get(place).cloned() else {
             return Fault { kind: Kind::Stop, target: Target::Router, lasts: lasts.min(Duration::from_secs(2)), after };
         };
-        // The replay is the world: whoever ends it, instead of striking it down, ends the run.
+        // The replay is the clock of the run: a requested end of it, other than a crash, ends the run.
         let kinds: &[Kind] = if name == "replay" {
             &[Kind::Kill, Kind::Stop, Kind::Cut, Kind::Silence]
         } else {

@@ -1,4 +1,4 @@
-//! Cables between the processes of a run and their router that can be cut, or fall silent.
+//! Virtual links between the processes of a run and their router that can be cut or silenced.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -11,19 +11,19 @@ use std::time::Duration;
 
 use bus::Endpoint;
 
-/// How often a silent cable looks whether it may speak again.
-const LOOK: Duration = Duration::from_millis(5);
+/// Interval at which a silenced link checks whether it is silenced still.
+const CHECK_PERIOD: Duration = Duration::from_millis(5);
 
-/// Passes on what processes and router say to each other.
+/// Forwards data between processes and router.
 pub struct Proxy {
-    /// Where processes connect.
+    /// Endpoint for the processes.
     pub endpoint: Endpoint,
     port: u16,
-    cables: Arc<Mutex<Vec<Cable>>>,
+    cables: Arc<Mutex<Vec<VirtualLink>>>,
 }
 
 /// A connection of one process.
-struct Cable {
+struct VirtualLink {
     /// The process's own port.
     port: u16,
     ends: [TcpStream; 2],
@@ -31,7 +31,7 @@ struct Cable {
 }
 
 impl Proxy {
-    /// Listens at a free port, and connects everyone to the router at `router_port` of this machine.
+    /// Listens at a free port, and forwards every connection to the router at `router_port` of this machine.
     ///
     /// # Panics
     /// When there is no free port.
@@ -39,11 +39,11 @@ impl Proxy {
     pub fn open(router_port: u16) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").expect("a free port");
         let port = listener.local_addr().expect("a bound socket has an address").port();
-        let cables = Arc::<Mutex<Vec<Cable>>>::default();
+        let cables = Arc::<Mutex<Vec<VirtualLink>>>::default();
         let laid = Arc::clone(&cables);
         thread::spawn(move || {
             for process in listener.incoming().flatten() {
-                // Without a router there is nobody to talk to; the process will try again.
+                // Without a router the connection is closed; the process will try again.
                 let Ok(router) = TcpStream::connect(("127.0.0.1", router_port)) else { continue };
                 if let Some(cable) = lay(process, router) {
                     let mut laid = laid.lock().unwrap_or_else(PoisonError::into_inner);
@@ -54,24 +54,24 @@ impl Proxy {
         Self { endpoint: Endpoint::loopback(port), port, cables }
     }
 
-    /// Cuts the cables of a process; returns how many there were.
+    /// Cuts the links of a process; returns their number.
     pub fn cut(&self, pid: u32) -> usize {
         self.each(pid, |cable| cable.ends.iter().for_each(|end| drop(end.shutdown(Shutdown::Both))))
     }
 
-    /// Lets nothing through to and from a process, or again; returns how many cables it has.
+    /// Silences a process's links, or ends that; returns their number.
     pub fn silence(&self, pid: u32, is_silent: bool) -> usize {
         self.each(pid, |cable| cable.is_silent.store(is_silent, Ordering::Relaxed))
     }
 
-    fn each(&self, pid: u32, act: impl Fn(&Cable)) -> usize {
+    fn each(&self, pid: u32, act: impl Fn(&VirtualLink)) -> usize {
         let ports = ports_of(pid, self.port);
         let cables = self.cables.lock().unwrap_or_else(PoisonError::into_inner);
         cables.iter().filter(|cable| ports.contains(&cable.port)).map(act).count()
     }
 }
 
-fn lay(process: TcpStream, router: TcpStream) -> Option<Cable> {
+fn lay(process: TcpStream, router: TcpStream) -> Option<VirtualLink> {
     let port = process.peer_addr().ok()?.port();
     let is_silent = Arc::<AtomicBool>::default();
     for end in [&process, &router] {
@@ -82,10 +82,10 @@ fn lay(process: TcpStream, router: TcpStream) -> Option<Cable> {
         let (from, to, is_silent) = (from.try_clone().ok()?, to.try_clone().ok()?, Arc::clone(&is_silent));
         thread::spawn(move || pass_on(from, to, &is_silent));
     }
-    Some(Cable { port, ends: [process, router], is_silent })
+    Some(VirtualLink { port, ends: [process, router], is_silent })
 }
 
-/// One direction, until either end is gone.
+/// One direction, until either end is closed.
 fn pass_on(mut from: TcpStream, mut to: TcpStream, is_silent: &AtomicBool) {
     let mut bytes = vec![0; 1 << 16];
     loop {
@@ -94,7 +94,7 @@ fn pass_on(mut from: TcpStream, mut to: TcpStream, is_silent: &AtomicBool) {
             Ok(count) => count,
         };
         while is_silent.load(Ordering::Relaxed) {
-            thread::sleep(LOOK);
+            thread::sleep(CHECK_PERIOD);
         }
         if to.write_all(&bytes[..count]).is_err() {
             break;
@@ -124,7 +124,7 @@ fn ports_of(pid: u32, port: u16) -> BTreeSet<u16> {
 mod tests {
     use super::*;
 
-    /// A router that says everything back.
+    /// A router that echoes everything.
     fn echo() -> u16 {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let port = listener.local_addr().unwrap().port();
@@ -140,7 +140,7 @@ mod tests {
     }
 
     #[test]
-    fn cables_pass_on_fall_silent_and_are_cut() {
+    fn virtual_links_forward_are_silenced_and_are_cut() {
         let proxy = Proxy::open(echo());
         let mut client = TcpStream::connect(("127.0.0.1", proxy.port)).unwrap();
         let mut answer = [0; 2];

@@ -1,5 +1,5 @@
-//! Damage of every sort for bytes of every sort, the same for the same seed: for the tests, the long run of
-//! `cargo bench -p tests --bench mutation` and the targets in `fuzz/`.
+//! Random damage to inputs, reproducible by seed: for the tests, the long run of `cargo bench -p tests --bench
+//! mutation` and the targets in `fuzz/`.
 
 pub mod readers;
 pub mod run;
@@ -8,30 +8,29 @@ pub mod wire_target;
 
 use support::random::SplitMix64;
 
-/// Longest input that damage makes, bytes: what takes much memory from so little does so on somebody's word alone.
+/// Largest damaged input, bytes: a reader that needs much memory for so little trusts a length in the input.
 pub const MAX_BYTES: usize = 1 << 16;
 
 /// Whole numbers that lengths and counts are set to.
 const EXTREMES: [u64; 12] =
     [0, 1, 0x7f, 0xff, 0x7fff, 0xffff, 0x7fff_ffff, 0xffff_ffff, 1 << 42, i64::MAX as u64, u64::MAX - 1, u64::MAX];
-/// Numbers that are none, or far from any that is meant.
+/// Invalid numbers, or numbers far from any valid one.
 const NUMBERS: [f64; 8] = [f64::NAN, f64::INFINITY, f64::NEG_INFINITY, 1e30, -1e30, 1e-320, -0.0, 4_294_967_296.0];
-/// What stands in texts where a number is expected.
-const WORDS: [&str; 12] =
+/// Texts in place of a number.
+const TEXTS: [&str; 12] =
     ["nan", "inf", "-inf", "1e30", "-1e400", "0", "-1", "18446744073709551616", "0x7f", "1e-400", "", "4398046511104"];
 
-/// A folder for files that are written over and over: in memory where the system has a place for that, as a disk would
-/// write every one of them down.
+/// A folder for files that are overwritten often: in memory if the system has a place for that, to spare the disk.
 ///
 /// # Panics
-/// When the disk refuses.
+/// When a file cannot be written.
 #[must_use]
 pub fn scratch() -> tempfile::TempDir {
     let in_memory = tempfile::tempdir_in("/dev/shm");
     in_memory.or_else(|_| tempfile::tempdir()).expect("a temporary folder")
 }
 
-/// Damages `bytes` in one to four ways; `other` is a sound input to take pieces from.
+/// Damages `bytes` in one to four ways; `other` is a valid input to take pieces from.
 pub fn damage(bytes: &mut Vec<u8>, other: &[u8], random: &mut SplitMix64) {
     let is_text = bytes.iter().take(256).all(|byte| byte.is_ascii_graphic() || byte.is_ascii_whitespace());
     for _ in 0..=random.below(4) {
@@ -53,7 +52,7 @@ fn damage_bytes(bytes: &mut Vec<u8>, other: &[u8], random: &mut SplitMix64) {
         4 => overwrite(bytes, at, &number(random)),
         5 => drop(bytes.drain(piece(bytes.len(), random))),
         6 => {
-            // A section that comes twice.
+            // A repeated section.
             let twice = bytes[piece(bytes.len(), random)].to_vec();
             splice(bytes, at, &twice);
         }
@@ -73,17 +72,17 @@ fn damage_text(bytes: &mut Vec<u8>, random: &mut SplitMix64) {
     let is_number = |byte: &u8| byte.is_ascii_digit() || b"+-.eE".contains(byte);
     match random.below(5) {
         0..=2 => {
-            // The number at or behind a random place becomes another one.
+            // Replaces the number at or after a random place.
             let from = random.below(bytes.len().max(1));
             let Some(begin) = bytes[from..].iter().position(u8::is_ascii_digit).map(|ahead| from + ahead) else {
                 return;
             };
             let end = bytes[begin..].iter().position(|byte| !is_number(byte)).map_or(bytes.len(), |len| begin + len);
-            let word = WORDS[random.below(WORDS.len())];
-            bytes.splice(begin..end, word.bytes());
+            let text = TEXTS[random.below(TEXTS.len())];
+            bytes.splice(begin..end, text.bytes());
         }
         3 => {
-            // A line comes twice, or not at all.
+            // Repeats or removes a line.
             let at = random.below(bytes.len().max(1));
             let begin = bytes[..at].iter().rposition(|byte| *byte == b'\n').map_or(0, |end| end + 1);
             let end = bytes[at..].iter().position(|byte| *byte == b'\n').map_or(bytes.len(), |len| at + len + 1);

@@ -1,4 +1,4 @@
-//! Every format that is read from disk: where a damaged file is laid, and what reads it.
+//! Readers of every format on disk: the path of the damaged file, and the function that reads it.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -20,21 +20,21 @@ use simulator::map;
 use super::seeds;
 use crate::sequences;
 
-/// A format, ready to be damaged in a folder of its own.
+/// A format and its reader, with a folder of its own.
 pub struct Reader {
-    /// Its name in tables.
+    /// Name in tables.
     pub name: &'static str,
-    /// Sound files.
+    /// Valid files.
     pub seeds: Vec<Vec<u8>>,
     path: PathBuf,
     read: fn(&Path, &[u8]) -> bool,
 }
 
 impl Reader {
-    /// Lays `bytes` where the file belongs and reads it; whether it was accepted.
+    /// Writes `bytes` to the file and reads it; returns true if it was accepted.
     ///
     /// # Panics
-    /// When the disk refuses.
+    /// When a file cannot be written.
     #[must_use]
     pub fn try_read(&self, bytes: &[u8]) -> bool {
         if !self.path.as_os_str().is_empty() {
@@ -47,7 +47,7 @@ impl Reader {
 /// Every format, each in a folder below `root`.
 ///
 /// # Panics
-/// When the disk refuses.
+/// When a file cannot be written.
 #[must_use]
 pub fn all(root: &Path) -> Vec<Reader> {
     let text = |text: &str| vec![text.as_bytes().to_vec()];
@@ -64,7 +64,7 @@ pub fn all(root: &Path) -> Vec<Reader> {
         in_memory("opendrive", text(seeds::OPENDRIVE), |_, bytes| map::opendrive::read_bytes(bytes).is_ok()),
         on_disk("mcap recording", vec![seeds::recording(root)], file("mcap", "a.mcap"), read_recording),
         on_disk("scenario", text(seeds::SCENARIO), file("scenario", "a.yaml"), |path, _| {
-            // What it names is not there, which is no fault of the file.
+            // Files that it names do not exist, which is no fault of the file.
             Scenario::read(path).inspect(|scenario| drop(scenario.check(path))).is_ok()
         }),
         on_disk("experiment", text(seeds::EXPERIMENT), file("experiment", "a.yaml"), |path, _| {
@@ -91,7 +91,7 @@ pub fn all(root: &Path) -> Vec<Reader> {
     all
 }
 
-/// Where a replay is, and the ticks that follow from there.
+/// Checkpoint of a replay, and the ticks that follow from it.
 fn read_place(path: &Path, _: &[u8]) -> bool {
     let tick = |number: u64| Tick { stem: number.to_string(), capture_nanos: number * 100_000_000 };
     let ticks: Vec<Tick> = (0..10).map(tick).collect();
@@ -99,7 +99,7 @@ fn read_place(path: &Path, _: &[u8]) -> bool {
     Schedule::new(&ticks, 0, None, true).resumed(place.position).take(20).count() <= 20
 }
 
-/// The annotations of OPV2V and V2V4Real, Python's matrices among them.
+/// The annotations of OPV2V and V2V4Real, with Python's matrices.
 fn frames(root: &Path) -> Vec<Reader> {
     let frame = |name: &str, text: &str| {
         let folder = root.join(name).join("scene/100");
@@ -161,9 +161,9 @@ fn drives(root: &Path) -> Vec<Reader> {
     .collect()
 }
 
-/// A folder of sound files; a reader for each that has a name.
+/// A folder of valid files; a reader for each that has a name.
 fn drive(folder: &Path, files: &[(&str, &[u8])], names: &[&'static str]) -> Vec<Reader> {
-    // A folder of its own for each, so that the others in it stay sound.
+    // A folder of its own for each, so that the other files stay valid.
     let reader = |(place, name): (usize, &&'static str)| {
         let own = folder.with_file_name(format!("{place}")).join(folder.file_name().unwrap_or_default());
         for (path, bytes) in files {
@@ -181,7 +181,7 @@ fn drive(folder: &Path, files: &[(&str, &[u8])], names: &[&'static str]) -> Vec<
     names.iter().enumerate().filter(|(place, name)| !name.is_empty() && *place < files.len()).map(reader).collect()
 }
 
-/// True where the first sweep of the first scenario can be read, and nothing is left out.
+/// True if the first sweep of the first scenario can be read, and nothing is left out.
 fn read_first(folder: &Path) -> bool {
     let Some(dataset) = dataset::open(folder).ok().filter(|dataset| dataset.problems.is_empty()) else { return false };
     let Some(scenario) = dataset.scenarios.first().filter(|scenario| !scenario.ticks.is_empty()) else { return false };

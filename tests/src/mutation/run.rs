@@ -1,4 +1,4 @@
-//! Many damaged inputs through one reader, and what came of it.
+//! Runs many damaged inputs through one reader and reports the outcome.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
@@ -9,34 +9,34 @@ use support::random::SplitMix64;
 
 use super::{damage, readers, seeds, wire_target};
 
-/// What came of one format.
+/// Report on one format.
 #[derive(Debug, Clone)]
 pub struct Report {
-    /// The format.
+    /// Name of the format.
     pub name: &'static str,
-    /// Damaged inputs.
+    /// Number of damaged inputs.
     pub cases: u64,
-    /// Of these, inputs that were taken for sound: what the damage left, or made, of them was.
+    /// Number of accepted inputs: the damage left them valid.
     pub accepted: u64,
     /// Seeds of the cases that panicked.
     pub panics: Vec<u64>,
-    /// Most memory that one case took beyond what was held before it.
+    /// Largest memory of one case beyond that before it.
     pub peak_bytes: usize,
-    /// All the time.
+    /// Total time.
     pub took: Duration,
 }
 
-/// RunScope damaged messages from `seed` on.
+/// Runs damaged messages from `seed` on.
 ///
 /// # Panics
-/// When a sound one is not accepted undamaged: then nothing behind the first check would be tried.
+/// When a valid one is not accepted undamaged: then nothing after the first check would be tested.
 #[must_use]
 pub fn messages(cases: u64, seed: u64, meter: &PeakAlloc) -> Report {
     let damage = wire_target::damage_message;
     one(("messages", &seeds::messages()), cases, seed, meter, damage, &wire_target::read)
 }
 
-/// RunScope damaged files of every format from `seed` on, one format after the other as reports are asked for.
+/// Runs damaged files of every format from `seed` on, one format after the other as reports are requested.
 ///
 /// # Panics
 /// As [`messages`].
@@ -47,10 +47,10 @@ pub fn files(scratch: &Path, cases: u64, seed: u64, meter: &PeakAlloc) -> impl I
     })
 }
 
-/// Every format with its sound inputs.
+/// Every format with its valid inputs.
 ///
 /// # Panics
-/// When the disk refuses.
+/// When a file cannot be written.
 #[must_use]
 pub fn formats(scratch: &Path) -> Vec<(&'static str, Vec<Vec<u8>>)> {
     let files = readers::all(scratch).into_iter().map(|reader| (reader.name, reader.seeds));

@@ -1,4 +1,4 @@
-//! Sound inputs to damage, made by our own code.
+//! Valid inputs to damage, made by the project's own code.
 
 use std::path::Path;
 
@@ -9,10 +9,10 @@ use recording::{RecordingOptions, RecordingWriter};
 #[path = "../../../protocol/tests/sample/mod.rs"]
 mod sample;
 
-/// A sealed message of every kind, and a map in every codec.
+/// A sealed message of every kind, and a feature map in every codec.
 ///
 /// # Panics
-/// Never: the samples are sound.
+/// Never: the samples are valid.
 #[must_use]
 pub fn messages() -> Vec<Vec<u8>> {
     let maps = sample::every_codec().into_iter().map(|config| protocol::Message::Bev(sample::bev(&config)));
@@ -20,7 +20,7 @@ pub fn messages() -> Vec<Vec<u8>> {
     all.map(|message| wire::encode_any(&sample::stamp(), message).expect("a sound message").to_vec()).collect()
 }
 
-/// Sweeps as text, as bytes and packed, with and without colours, and as PCL leaves them: stretched, and padded.
+/// Sweeps as text, binary and compressed, with and without colours, and as PCL writes them: organised, and padded.
 #[must_use]
 pub fn clouds() -> Vec<Vec<u8>> {
     let kinds = [Encoding::Ascii, Encoding::Binary]
@@ -35,7 +35,7 @@ pub fn clouds() -> Vec<Vec<u8>> {
     files
 }
 
-/// Three points with the padding of a message, some of it of no bytes, and more bytes than stated behind them.
+/// Three points with the padding of a message, some of it of no bytes, and more bytes after them than stated.
 fn padded() -> Vec<u8> {
     let mut file = b"# .PCD v0.7\nVERSION .7\nFIELDS x y z _ intensity _ ring _\nSIZE 4 4 4 1 1 1 2 1\n\
         TYPE F F F U U U U U\nCOUNT 1 1 1 4 1 0 1 9\nWIDTH 3\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 3\nDATA binary\n"
@@ -49,11 +49,11 @@ fn padded() -> Vec<u8> {
     file
 }
 
-/// As little of a header as there may be, and the numbers of C libraries.
+/// A minimal header, and the number texts of C libraries.
 const SPARSE: &str = "# points\nCOLUMNS x y z reflectivity\nSIZE 4 4 8 2\nTYPE F F F U\nWIDTH 4\nDATA ascii\n\
     1 2 3 4 \r\n\n-1.5e-05 68.34235382 .5 65535\nnan -nan inf 0\n1.#QNAN 0 0 0\n";
 
-/// Four points, packed by LZF as nothing but literals.
+/// Four points, compressed by LZF as literals only.
 fn compressed() -> Vec<u8> {
     let body: Vec<u8> = (0..16).flat_map(|number| (number as f32).to_le_bytes()).collect();
     let packed: Vec<u8> = body.chunks(32).flat_map(|run| [&[run.len() as u8 - 1][..], run].concat()).collect();
@@ -70,7 +70,7 @@ fn compressed() -> Vec<u8> {
 /// A recording of a message of every kind.
 ///
 /// # Panics
-/// When the disk refuses.
+/// When a file cannot be written.
 #[must_use]
 pub fn recording(scratch: &Path) -> Vec<u8> {
     let path = scratch.join("seed.mcap");
@@ -85,13 +85,13 @@ pub fn recording(scratch: &Path) -> Vec<u8> {
     std::fs::read(&path).expect("it was written")
 }
 
-/// The description of a frame as OPV2V keeps it.
+/// The annotation of a frame as OPV2V stores it.
 pub const OPV2V: &str = "lidar_pose: [1.5, -2.0, 1.9, 0.0, 90.0, 0.0]\ntrue_ego_pos: [1.5, -2.0, 1.9, 0.0, 90.0, 0.0]\n\
     ego_speed: 36.0\nvehicles:\n  100:\n    angle: [0.0, 12.5, 0.0]\n    center: [0.0, 0.0, 0.8]\n    \
     extent: [2.0, 0.9, 0.8]\n    location: [20.0, 3.0, 0.0]\n    speed: 36.0\n  101: &car\n    angle: [0.0, 0.0, 0.0]\n    \
     center: [0.0, 0.0, 0.8]\n    extent: [2.0, 0.9, 0.8]\n    location: [-8.0, 3.0, 0.0]\n    speed: 0.0\n";
 
-/// The same as V2V4Real does: matrices as Python wrote them.
+/// The same as V2V4Real stores it: matrices as Python wrote them.
 pub const V2V4REAL: &str = concat!(
     include_str!("../../../sim-replay/dataset/src/numpy_tags/numpy_matrix.yaml"),
     "true_ego_pos: [0, 0, 0, 0, 0, 0]\nego_speed: 3.6\nvehicles:\n  1:\n    angle: [0, 90, 0]\n    center: [0, 0, 0]\n    \
@@ -126,7 +126,7 @@ pub const SCENARIO: &str = "run: test\nscene: {dir: scene, rate: 1.0, seek: 0, f
 /// A grid of runs.
 pub const EXPERIMENT: &str = include_str!("../../../deploy/experiments/smoke.yaml");
 
-/// An emulated air.
+/// A link emulation.
 pub const LINK: &str = include_str!("../../../deploy/experiments/links/newest-first.yaml");
 
 /// Tables of methods.
@@ -135,13 +135,13 @@ pub const TABLES: &str = "dataset: scenes\nweights: weights\ndtype: f16\nframes:
     - {name: PGC, poses: {cached: {file: poses.csv}}, delay_ms: 100}\n  \
     - {name: noisy, poses: {noisy: {mode: independent, position_std_m: 1, heading_std_deg: 1}}}\n";
 
-/// What a link did over time.
+/// A trace of a link.
 pub const TRACE: &str = "time_s,rate_mbps,delay_ms,loss\n0,27,10,0.01\n0.5,6,20.5,0\n1.25,0,100,1\n";
 
-/// When packets could leave.
+/// Departure times of packets, milliseconds.
 pub const MAHIMAHI: &str = "0\n1\n1\n5\n12\n40\n";
 
-/// Where a replay is.
+/// A checkpoint of a replay.
 pub const PLACE: &str = "{\"scenario\":\"town\",\"position\":{\"next_tick\":7,\"left\":12,\"shift_nanos\":1000000000,\
     \"last_nanos\":1600000000},\"is_halted\":false,\"ticks\":17,\"unanswered\":0,\"unreadable_frames\":1}\n";
 

@@ -1,14 +1,15 @@
-//! Messages under damage: whatever is accepted is sound.
+//! Damaged messages: every accepted message is valid.
 
 use protocol::{HEADER_LEN, Header, Limits, Message, WireError, wire};
 use support::random::SplitMix64;
 
 use super::damage;
 
-/// The limits under which damaged messages are decoded.
+/// Limits under which damaged messages are decoded.
 pub const LIMITS: Limits = Limits::DEFAULT;
 
-/// Damages a sealed message; in most cases lengths and checksums are put right again, so that the damage gets past them.
+/// Damages a sealed message; in most cases lengths and checksums are corrected afterwards, so that the damage passes
+/// their checks.
 pub fn damage_message(bytes: &mut Vec<u8>, other: &[u8], random: &mut SplitMix64) {
     damage(bytes, other, random);
     match random.below(10) {
@@ -18,7 +19,7 @@ pub fn damage_message(bytes: &mut Vec<u8>, other: &[u8], random: &mut SplitMix64
     }
 }
 
-/// Puts the checksums right, and the lengths where `lengths` says so.
+/// Corrects the checksums, and the lengths if `lengths`.
 pub fn reseal(bytes: &mut [u8], lengths: bool) {
     if bytes.len() < HEADER_LEN {
         return;
@@ -36,10 +37,10 @@ pub fn reseal(bytes: &mut [u8], lengths: bool) {
     bytes[HEADER_LEN - 4..HEADER_LEN].copy_from_slice(&header.to_le_bytes());
 }
 
-/// Decodes a message, maps to the last value; whether it was accepted.
+/// Decodes a message, feature maps to the last value; returns true if it was accepted.
 ///
 /// # Panics
-/// When what was accepted has a wrong checksum, or numbers that are none.
+/// When an accepted message has a wrong checksum, or values that are not finite.
 pub fn read(bytes: &[u8]) -> bool {
     let whole: Result<(Header, Message), WireError> = wire::decode_any([bytes], &LIMITS);
     let Ok((_, message)) = whole else { return false };
@@ -49,7 +50,10 @@ pub fn read(bytes: &[u8]) -> bool {
     match message {
         Message::Bev(bev) => match bev.features.decode(&LIMITS) {
             Ok(map) => {
-                assert!(map.features.values.iter().all(|value| value.is_finite()), "a map with numbers that are none");
+                assert!(
+                    map.features.values.iter().all(|value| value.is_finite()),
+                    "a map with values that are not finite"
+                );
                 true
             }
             Err(_) => false,
@@ -61,6 +65,6 @@ pub fn read(bytes: &[u8]) -> bool {
 }
 
 fn are_finite(points: &[[f32; 4]]) -> bool {
-    assert!(points.iter().flatten().all(|value| value.is_finite()), "points with numbers that are none");
+    assert!(points.iter().flatten().all(|value| value.is_finite()), "points with values that are not finite");
     true
 }

@@ -1,4 +1,4 @@
-//! One peer sends as fast as it can; the others come through, and what waits stays within its bound.
+//! Flood by one peer: the others' messages arrive, and the queue stays within its bound.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -24,21 +24,21 @@ fn connect(sender: &Bus, ego: &Bus, topic: &Topic) {
     Barrier::new([route]).await_routes(sender).unwrap().wait(PATIENCE).unwrap();
 }
 
-/// Takes until every message of the honest sender has come; how many of both.
-fn listen(inbox: &Inbox, books: &Bus) -> [u64; 2] {
-    let (mut heard, deadline) = ([0; 2], Instant::now() + PATIENCE);
-    while heard[0] < HONEST {
+/// Receives until every message of the honest sender has arrived; the number of both senders' messages.
+fn receive(inbox: &Inbox, bus: &Bus) -> [u64; 2] {
+    let (mut received, deadline) = ([0; 2], Instant::now() + PATIENCE);
+    while received[0] < HONEST {
         match inbox.take(Some(deadline)) {
             Pop::Item(topic, Event::Message(arrival)) => {
                 arrival.decode::<Lidar>(&Limits::DEFAULT).unwrap();
-                books.books().received(&topic);
-                heard[usize::from(topic.to_string() != "1/lidar")] += 1;
+                bus.books().received(&topic);
+                received[usize::from(topic.to_string() != "1/lidar")] += 1;
             }
             Pop::Item(..) => {}
-            Pop::TimedOut | Pop::Closed => panic!("{heard:?} of {HONEST} came through"),
+            Pop::TimedOut | Pop::Closed => panic!("{received:?} of {HONEST} came through"),
         }
     }
-    heard
+    received
 }
 
 #[test]
@@ -66,7 +66,7 @@ fn a_flood_from_one_peer_costs_the_others_nothing() {
             flood.finish();
         }
     });
-    // So many that most of them are too many, however slow this machine is.
+    // So many that most of them are over the limit, however slow this machine is.
     wait_for("a flood", || sent.load(Ordering::Relaxed) > 200);
     let began = Instant::now();
     let calm_sender = std::thread::spawn(move || {
@@ -76,7 +76,7 @@ fn a_flood_from_one_peer_costs_the_others_nothing() {
         }
         calm.finish();
     });
-    let [calm, stormy] = listen(&inbox, &ego);
+    let [calm, stormy] = receive(&inbox, &ego);
     let seconds = began.elapsed().as_secs_f64();
     is_over.store(true, Ordering::Relaxed);
     calm_sender.join().unwrap();
@@ -95,7 +95,7 @@ fn a_flood_from_one_peer_costs_the_others_nothing() {
 fn what_waits_is_bounded_in_bytes() {
     let router = TestRouter::open();
     let (sender, ego) = (router.join("agent-1", "1"), router.join("ego-9", "9"));
-    // Places for 64 messages, and bytes for two and a half.
+    // Room for 64 messages, and bytes for two and a half.
     let limits = InboxLimits { waiting_bytes: 160_000, ..InboxLimits::NONE };
     let inbox = ego.limited_inbox(64, 4, limits);
     let topic = topic("1/lidar");

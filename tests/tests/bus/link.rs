@@ -1,4 +1,4 @@
-//! The emulated air in a live run: an agent, the link and an ego over real zenoh sessions.
+//! Link emulation in a live run: an agent, the link and an ego over real zenoh sessions.
 
 use std::path::Path;
 use std::time::Duration;
@@ -11,7 +11,7 @@ use protocol::{CavId, DropReason, Ledger, Limits, PointCloud, Pose, PoseEstimate
 use sim_replay::link_node::{self, LinkReport, NodeOptions};
 use tests::bus::{PATIENCE, TestRouter, next_event, wait_for};
 
-/// Sweeps that are sent, and their points: 16 kB each.
+/// Number of sweeps that are sent, and of their points: 16 kB each.
 const COUNT: u64 = 6;
 const POINTS: u16 = 1000;
 
@@ -24,7 +24,8 @@ fn points(tick: u64) -> Points {
     Points { pose: PoseEstimate::new(Pose::IDENTITY, 1.0), points: PointCloud { xyzi } }
 }
 
-/// When each message came, after the first was offered, by capture time; what the link says; all books.
+/// Arrival time of each message after the first was offered, by capture time; the link's report; the sum of all
+/// ledgers.
 struct Crossing {
     arrivals: Vec<(u64, Duration)>,
     report: LinkReport,
@@ -47,7 +48,7 @@ fn cross(config: LinkConfig, options: &NodeOptions) -> Crossing {
     let router = TestRouter::open();
     let [agent, link, ego] =
         [("agent-7", "7"), ("link-9", "9"), ("ego-9", "9")].map(|(name, id)| router.join(name, id));
-    let air = LinkEmulator::new(config, Path::new("."), 1).unwrap();
+    let emulator = LinkEmulator::new(config, Path::new("."), 1).unwrap();
     let (sent, received) = (
         Topic::Stream { cav: cav("7"), stream: Stream::Points },
         Topic::Received { ego: cav("9"), cav: cav("7"), stream: Stream::Points },
@@ -56,7 +57,7 @@ fn cross(config: LinkConfig, options: &NodeOptions) -> Crossing {
     let _subscription = ego.subscribe(received.clone(), &inbox).unwrap();
     let stop = Stop::new();
     let (arrivals, report) = std::thread::scope(|scope| {
-        let carrying = scope.spawn(|| link_node::run(&link, air, options, &stop).unwrap());
+        let carrying = scope.spawn(|| link_node::run(&link, emulator, options, &stop).unwrap());
         let presence = agent.announce(Role::Agent).unwrap();
         let publisher = agent.publisher(sent.clone(), PublisherOptions::FEATURES.lossless(16)).unwrap();
         wait_for_route(&agent, &sent, "link-9");
@@ -65,7 +66,7 @@ fn cross(config: LinkConfig, options: &NodeOptions) -> Crossing {
         (0..COUNT).for_each(|tick| publisher.offer(tick, points(tick)));
         publisher.finish();
         let mut arrivals = Vec::new();
-        // What ends on one side of the link ends on the other.
+        // The end of the agent's topic is forwarded to the ego.
         while let (_, Event::Message(arrival)) = next_event(&inbox) {
             let stamp = &arrival.header.stamp;
             assert_eq!((&stamp.cav, stamp.sequence), (&cav("7"), arrivals.len() as u64));
@@ -99,7 +100,7 @@ fn messages_come_late_in_order_and_unchanged() {
 }
 
 #[test]
-fn what_the_air_loses_is_booked_and_never_arrives() {
+fn a_lost_message_is_counted_and_never_arrives() {
     let Crossing { arrivals, report, ledger } =
         cross(LinkConfig { loss: LossModel::Bernoulli(1.0), ..LinkConfig::default() }, &options());
     assert_eq!((arrivals.len(), report.arrived), (0, 0));
@@ -111,7 +112,7 @@ fn what_the_air_loses_is_booked_and_never_arrives() {
 fn a_clock_that_is_off_shows_in_the_capture_times() {
     let clock = DeviceClock { offset_ms: 1.0, ..DeviceClock::default() };
     let Crossing { arrivals, ledger, .. } = cross(LinkConfig { clock, ..LinkConfig::default() }, &options());
-    // What tells of no moment has no capture time.
+    // A message without a capture time has 0.
     let shown: Vec<u64> = (0..COUNT).map(|tick| if tick == 0 { 0 } else { tick + 1_000_000 }).collect();
     assert_eq!(arrivals.iter().map(|(tick, _)| *tick).collect::<Vec<_>>(), shown);
     assert!(ledger.balance().is_exact(), "{:?}", ledger.balance());
@@ -130,23 +131,23 @@ fn a_long_delay_keeps_no_more_than_it_may() {
 }
 
 #[test]
-fn a_link_that_carries_nothing_says_so() {
+fn a_link_that_carries_nothing_reports_it() {
     let router = TestRouter::open();
     let [agent, link] = [("agent-7", "7"), ("link-9", "9")].map(|(name, id)| router.join(name, id));
     let folder = tempfile::tempdir().unwrap();
     std::fs::write(folder.path().join("rates.csv"), "time_s,rate_mbps,delay_ms,loss\n0,27,0,0\n60,0,0,0\n").unwrap();
     let trace = TraceConfig { offset_s: 60.0, ..TraceConfig::new(Path::new("rates.csv")) };
     let config = LinkConfig { capacity: CapacityConfig::Trace(trace), ..LinkConfig::default() };
-    let air = LinkEmulator::new(config, folder.path(), 1).unwrap();
+    let emulator = LinkEmulator::new(config, folder.path(), 1).unwrap();
     let (sent, stop, options) = (Topic::Stream { cav: cav("7"), stream: Stream::Points }, Stop::new(), options());
     let report = std::thread::scope(|scope| {
-        let carrying = scope.spawn(|| link_node::run(&link, air, &options, &stop).unwrap());
+        let carrying = scope.spawn(|| link_node::run(&link, emulator, &options, &stop).unwrap());
         let _presence = agent.announce(Role::Agent).unwrap();
         let publisher = agent.publisher(sent.clone(), PublisherOptions::FEATURES.lossless(16)).unwrap();
         wait_for_route(&agent, &sent, "link-9");
         (0..COUNT).for_each(|tick| publisher.offer(tick, points(tick)));
         publisher.finish();
-        // Longer than any message of use is under way.
+        // Longer than any useful message is in flight.
         std::thread::sleep(Duration::from_millis(5_500));
         stop.request();
         carrying.join().unwrap()
@@ -156,15 +157,15 @@ fn a_link_that_carries_nothing_says_so() {
 }
 
 #[test]
-fn a_flood_ends_in_front_of_the_air() {
+fn a_flood_is_limited_before_the_link() {
     let router = TestRouter::open();
     let [agent, link] = [("agent-7", "7"), ("link-9", "9")].map(|(name, id)| router.join(name, id));
-    let air = LinkEmulator::new(LinkConfig::default(), Path::new("."), 1).unwrap();
+    let emulator = LinkEmulator::new(LinkConfig::default(), Path::new("."), 1).unwrap();
     let (sent, stop) = (Topic::Stream { cav: cav("7"), stream: Stream::Points }, Stop::new());
-    // Little more than the one that shows the route.
+    // Little more than the probe of the route.
     let narrow = NodeOptions { inbox: InboxLimits { messages_per_s: 0.6, ..InboxLimits::PEERS }, ..options() };
     let report = std::thread::scope(|scope| {
-        let carrying = scope.spawn(|| link_node::run(&link, air, &narrow, &stop).unwrap());
+        let carrying = scope.spawn(|| link_node::run(&link, emulator, &narrow, &stop).unwrap());
         let _presence = agent.announce(Role::Agent).unwrap();
         let publisher = agent.publisher(sent.clone(), PublisherOptions::FEATURES.lossless(16)).unwrap();
         wait_for_route(&agent, &sent, "link-9");
@@ -191,10 +192,10 @@ fn an_agent_that_comes_back_is_carried_again() {
     let (stop, options) = (Stop::new(), options());
     let mut ledger = Ledger::default();
     std::thread::scope(|scope| {
-        // While another agent is there the link does not end.
+        // The link does not end while another agent is alive.
         let presence = other.announce(Role::Agent).unwrap();
-        let air = LinkEmulator::new(LinkConfig::default(), Path::new("."), 1).unwrap();
-        let carrying = scope.spawn(|| link_node::run(&link, air, &options, &stop).unwrap());
+        let emulator = LinkEmulator::new(LinkConfig::default(), Path::new("."), 1).unwrap();
+        let carrying = scope.spawn(|| link_node::run(&link, emulator, &options, &stop).unwrap());
         for ticks in [0..3, 3..6] {
             let agent = router.join("agent-7", "7");
             let presence = agent.announce(Role::Agent).unwrap();

@@ -1,4 +1,4 @@
-//! Scenes as live traffic: order, pace, steering, what is missing, what is unreadable.
+//! Replay of scenes: order, pace, control, missing and unreadable files.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -23,7 +23,7 @@ fn topic(cav: &str, stream: Stream) -> Topic {
     Topic::Stream { cav: CavId::new(cav).unwrap(), stream }
 }
 
-/// Listens to everything a replay publishes, under the names of the agents it waits for.
+/// Subscriber to everything a replay publishes, under the names of the agents it waits for.
 struct Listener {
     buses: Vec<Bus>,
     inbox: Arc<Inbox>,
@@ -97,18 +97,18 @@ fn what_is_published_is_what_was_recorded() {
     let listener = Listener::new(&router);
     play(&router, &scenario, StreamOptions::default());
     let frame = scenario.load(1, 0, &dataset::LoadOptions::default()).unwrap();
-    let (mut seen, books) = (0, &listener.inbox);
+    let (mut seen, inbox) = (0, &listener.inbox);
     while seen < 3 {
         let (found, Event::Message(arrival)) = next_event(&listener.inbox) else { continue };
         if found == topic("20", Stream::Lidar) {
-            assert_eq!(books.decode::<Lidar>(&arrival, &Limits::DEFAULT).unwrap().points, frame.points);
+            assert_eq!(inbox.decode::<Lidar>(&arrival, &Limits::DEFAULT).unwrap().points, frame.points);
             seen += 1;
         } else if found == topic("20", Stream::Gnss) {
-            let gnss: Gnss = books.decode(&arrival, &Limits::DEFAULT).unwrap();
+            let gnss: Gnss = inbox.decode(&arrival, &Limits::DEFAULT).unwrap();
             assert_eq!(Some(gnss.world_from_lidar), frame.world_from_lidar);
             seen += 1;
         } else if found == Topic::Truth {
-            let truth: Truth = books.decode(&arrival, &Limits::DEFAULT).unwrap();
+            let truth: Truth = inbox.decode(&arrival, &Limits::DEFAULT).unwrap();
             assert_eq!(truth.agents.len(), 2);
             assert_eq!(truth.agents[1].objects.len(), frame.objects.len());
             assert_eq!(truth.agents[1].objects[0].class, "car");
@@ -118,7 +118,7 @@ fn what_is_published_is_what_was_recorded() {
 }
 
 #[test]
-fn previews_are_for_onlookers_alone() {
+fn previews_are_published_for_viewers_only() {
     let folder = tempfile::tempdir().unwrap();
     scene::write(folder.path(), &AGENTS, 6);
     let (router, scenario) = (TestRouter::open(), scenario(folder.path()));
@@ -128,14 +128,14 @@ fn previews_are_for_onlookers_alone() {
     let everything = recorder.tap(&[KeyExpr::run(&recorder.identity().run)], 64).unwrap();
     assert!(!preview.is_wanted(), "a recorder has whole sweeps");
     let viewer = router.join("viewer", "viewer");
-    let looking = viewer.tap(&[KeyExpr::stream(&viewer.identity().run, Stream::Preview)], 64).unwrap();
-    wait_for("somebody looks", || preview.is_wanted());
+    let viewing = viewer.tap(&[KeyExpr::stream(&viewer.identity().run, Stream::Preview)], 64).unwrap();
+    wait_for("a subscriber to previews", || preview.is_wanted());
     let _listener = Listener::new(&router);
     play(&router, &scenario, StreamOptions::default());
 
     let at_once = || Some(Instant::now());
     let mut previews = 0;
-    while let Pop::Item(found, preview) = looking.take(at_once()) {
+    while let Pop::Item(found, preview) = viewing.take(at_once()) {
         assert!(matches!(found, Topic::Stream { stream: Stream::Preview, .. }), "{found}");
         let (header, Lidar { points }) = wire::decode([preview.bytes().as_ref()], &Limits::DEFAULT).unwrap();
         let agent = AGENTS.iter().position(|cav| header.stamp.cav.as_str() == *cav).unwrap();
@@ -151,8 +151,8 @@ fn previews_are_for_onlookers_alone() {
         recorded += 1;
     }
     assert!(recorded > 12, "{recorded}");
-    drop(looking);
-    wait_for("nobody looks any more", || !preview.is_wanted());
+    drop(viewing);
+    wait_for("no subscriber to previews", || !preview.is_wanted());
 }
 
 #[test]
@@ -186,12 +186,12 @@ fn pause_step_seek_and_resume_steer_the_clock() {
             let options = StreamOptions { repeats: true, ..StreamOptions::default() };
             play_until(&router, &scenario, options, &stop)
         });
-        // While ticks come, the replay listens: its subscriptions have gone the same way before them.
+        // While ticks arrive, the replay receives: its subscriptions were sent before them.
         while next_truth().0 < 2 {}
         operator.say(Control::Pause, 0);
         operator.say(Control::Seek { tick: 6 }, 0);
         operator.say(Control::Step { ticks: 1 }, 0);
-        // Anything before tick 6 was out before the pause arrived.
+        // Any tick before 6 was published before the pause arrived.
         let capture = loop {
             let (index, capture) = next_truth();
             if index == 6 {
@@ -215,7 +215,7 @@ fn pause_step_seek_and_resume_steer_the_clock() {
 }
 
 #[test]
-fn a_second_life_goes_on_where_the_first_was_and_does_not_wait_for_those_who_are_away() {
+fn a_restarted_replay_resumes_and_does_not_wait_for_offline_agents() {
     let folder = tempfile::tempdir().unwrap();
     scene::write(folder.path(), &AGENTS, 12);
     let (router, scenario) = (TestRouter::open(), scenario(folder.path()));
@@ -236,7 +236,7 @@ fn a_second_life_goes_on_where_the_first_was_and_does_not_wait_for_those_who_are
         seen.resize_with(ticks, next_truth);
         seen
     });
-    // One more that never comes: a first life would wait for it for a minute.
+    // A route that never exists: the first instance would wait for it for a minute.
     let missing = "99/lidar>agent-99".parse().unwrap();
     let report = play(&router, &scenario, StreamOptions { expect: vec![missing], ..options.clone() });
     seen.resize_with(12, next_truth);
@@ -247,7 +247,7 @@ fn a_second_life_goes_on_where_the_first_was_and_does_not_wait_for_those_who_are
     std::fs::write(&bookmark, "{}").unwrap();
     let bus = router.join("replay", "replay");
     let error = Replay::prepare(&bus, &scenario, options, &Stop::new()).err().unwrap().to_string();
-    assert!(error.contains("replay.json: not the place of a replay: missing field"), "{error}");
+    assert!(error.contains("replay.json: not a replay checkpoint: missing field"), "{error}");
 }
 
 #[test]
@@ -322,7 +322,7 @@ fn a_request_to_stop_ends_a_loop_without_end() {
         report
     });
     assert!(report.ticks >= 5);
-    // Capture times rise over every loop.
+    // Capture times increase over every loop.
     let mut last = 0;
     while let Pop::Item(found, event) = listener.inbox.take(Some(Instant::now() + Duration::from_millis(200))) {
         if let (Topic::Truth, Event::Message(arrival)) = (found, event) {

@@ -1,4 +1,4 @@
-//! The bus through real zenoh sessions: a router and clients on loopback.
+//! Bus through real zenoh sessions: a router and clients on loopback.
 
 use std::sync::mpsc;
 use std::time::{Duration, Instant};
@@ -32,7 +32,7 @@ fn gnss(x_m: f64) -> Gnss {
     }
 }
 
-/// A sweep of `count` points whose values tell them apart.
+/// A sweep of `count` points with distinct values.
 fn sweep(count: u16) -> Lidar {
     Lidar { points: PointCloud { xyzi: (0..count).map(|i| [f32::from(i), 1.0, 2.0, 0.5]).collect() } }
 }
@@ -114,26 +114,26 @@ fn no_first_frame_is_lost_in_twenty_cold_starts() {
 }
 
 #[test]
-fn a_process_whose_work_stands_still_falls_silent() {
+fn a_process_with_a_stalled_worker_stops_its_heartbeat() {
     let router = TestRouter::open();
     let (agent, watcher) = (router.join("agent-7", "7"), router.join("watcher", "watcher"));
-    let told = watcher.inbox(64, 4);
-    let _told = watcher.subscribe(topic("stats/agent-7"), &told).unwrap();
-    let says = |patience: Duration| matches!(told.take(Some(Instant::now() + patience)), Pop::Item(..));
-    assert!(says(PATIENCE), "it says how it is");
+    let heartbeats = watcher.inbox(64, 4);
+    let _subscription = watcher.subscribe(topic("stats/agent-7"), &heartbeats).unwrap();
+    let reports = |patience: Duration| matches!(heartbeats.take(Some(Instant::now() + patience)), Pop::Item(..));
+    assert!(reports(PATIENCE), "a heartbeat");
 
     let inbox = agent.inbox(1, 1);
     let working = agent.works_from(&inbox);
-    // It waits for work, for longer than it takes to say anything.
+    // It waits for work, for longer than the interval between two reports.
     assert!(matches!(inbox.take(Some(Instant::now() + Duration::from_millis(1200))), Pop::TimedOut));
-    while says(Duration::from_millis(1)) {}
-    // It has come by since the last time, which is said once; and does not come back.
-    says(Duration::from_millis(700));
-    assert!(!says(Duration::from_millis(1500)), "it speaks though its work stands still");
+    while reports(Duration::from_millis(1)) {}
+    // Its worker was active since the last report, which is reported once; then it stalls.
+    reports(Duration::from_millis(700));
+    assert!(!reports(Duration::from_millis(1500)), "a heartbeat although its worker is stalled");
     working.beat();
-    assert!(says(PATIENCE), "it came by");
+    assert!(reports(PATIENCE), "its worker was active");
     drop(working);
-    assert!((0..3).all(|_| says(PATIENCE)), "its work is done: it says how it is as before");
+    assert!((0..3).all(|_| reports(PATIENCE)), "its work is done: heartbeats as before");
     agent.leave(PATIENCE).unwrap();
     watcher.leave(PATIENCE).unwrap();
 }
@@ -150,24 +150,24 @@ fn a_missing_pair_is_named() {
 }
 
 #[test]
-fn nobody_says_for_another_what_that_one_has_heard() {
+fn a_process_reports_only_its_own_routes() {
     let router = TestRouter::open();
     let (replay, agent) = (router.join("replay", "replay"), router.join("agent-8", "8"));
     let routes = ["7/lidar>agent-7", "7/lidar>agent-8"].map(|route| route.parse::<Route>().unwrap());
     let barrier = Barrier::new(routes.clone()).await_routes(&replay).unwrap();
     let key = agent.key(Topic::Ready(agent.identity().process.clone())).to_string();
     let mut sequence = 0;
-    let mut say = |process: &str| {
+    let mut report_ready = |process: &str| {
         let stamp = Stamp { cav: cav("8"), epoch: u64::MAX, sequence, capture_nanos: 0, publish_nanos: 0 };
         sequence += 1;
         let ready = Control::Ready { process: process.parse().unwrap(), heard: vec![topic("7/lidar")] };
         let bytes = protocol::wire::encode(&stamp, ready).unwrap().to_vec();
         agent.session().put(&key, bytes).congestion_control(CongestionControl::Block).wait().unwrap();
     };
-    // In this order: when the second is heard, the first has been.
-    wait_for("its own notice", || {
-        say("agent-7");
-        say("agent-8");
+    // In this order: when the second is received, the first has been.
+    wait_for("its own report", || {
+        report_ready("agent-7");
+        report_ready("agent-8");
         !barrier.missing().contains(&routes[1])
     });
     assert_eq!(barrier.missing(), routes[..1]);
@@ -184,7 +184,7 @@ fn a_slow_consumer_gets_the_newest_and_every_loss_is_counted() {
     connect(&replay, &agent, &topic);
     (0..10).for_each(|tick| publisher.offer(tick, sweep(1000)));
     publisher.finish();
-    // The consumer looks only now, when all have arrived.
+    // The consumer reads only now, when all have arrived.
     let account = Account::towards(topic.clone(), &agent.identity().process);
     wait_for("nine superseded", || {
         let ledger = agent.books().ledger();
@@ -232,18 +232,18 @@ fn an_overloaded_publisher_returns_at_once_and_counts() {
 }
 
 #[test]
-fn a_late_joiner_is_seen_hears_and_is_missed() {
+fn a_late_joiner_is_detected_receives_and_its_end_is_detected() {
     let router = TestRouter::open();
     let ego = router.join("ego-1", "1");
-    let (report, sightings) = mpsc::channel();
+    let (report, events) = mpsc::channel();
     let early = router.join("agent-1", "1");
     let _presence = early.announce(Role::Agent).unwrap();
     let _watch = ego
-        .watch(Role::Agent, move |sighting| {
-            let _ = report.send(sighting);
+        .watch(Role::Agent, move |event| {
+            let _ = report.send(event);
         })
         .unwrap();
-    let seen = |sighting: LivelinessEvent| assert_eq!(sightings.recv_timeout(PATIENCE).unwrap(), sighting);
+    let seen = |event: LivelinessEvent| assert_eq!(events.recv_timeout(PATIENCE).unwrap(), event);
     seen(LivelinessEvent::Appeared { role: Role::Agent, cav: cav("1") });
 
     let late = router.join("agent-2", "2");
@@ -259,7 +259,7 @@ fn a_late_joiner_is_seen_hears_and_is_missed() {
 
     presence.withdraw().unwrap();
     seen(LivelinessEvent::Vanished { role: Role::Agent, cav: cav("2") });
-    // One that dies without a word is missed as well.
+    // A crashed one is detected as well.
     early.session().close().wait().unwrap();
     seen(LivelinessEvent::Vanished { role: Role::Agent, cav: cav("1") });
 }
@@ -291,7 +291,7 @@ fn wrong_bytes_are_counted_and_survived() {
     let other_kind = protocol::wire::encode(&stamp, sweep(3)).unwrap();
     let hostile = [
         vec![],
-        b"nothing of ours".to_vec(),
+        b"no such message".to_vec(),
         sound[..sound.len() - 1].to_vec(),
         changed(4, 99),
         changed(60, !sound[60]),

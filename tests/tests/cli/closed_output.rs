@@ -1,4 +1,4 @@
-//! Programs whose standard output and error nobody reads any more, as behind `| head -1`.
+//! Programs whose standard output and error have no reader, as before `| head -1`.
 
 use std::io::pipe;
 use std::net::TcpListener;
@@ -6,7 +6,7 @@ use std::process::{Command, Stdio};
 
 use tests::fleet::{programs, write_weights};
 
-/// The exit code of a program whose standard output, and where asked for standard error, nobody reads.
+/// Exit code of a program whose standard output, and if requested standard error, has no reader.
 fn code_unread(program: &str, arguments: &[&str], is_error_unread: bool) -> Option<i32> {
     let (reader, writer) = pipe().unwrap();
     drop(reader);
@@ -28,7 +28,7 @@ fn every_program_comes_to_its_quiet_end() {
     write_weights(&weights);
     let free = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
     let listen = format!("tcp/{free}");
-    // Its supervisor is gone, so that it joins, prints what it did, and ends.
+    // Its supervisor has ended, so that it joins, prints its report, and ends.
     let agent = ["run", "--run=t", "--cav=4279", "--supervised", "--listen", &listen, "--weights"];
     let agent = [&agent[..], &[weights.to_str().unwrap()]].concat();
     let commands: [(&str, &[&str]); 6] = [
@@ -45,7 +45,7 @@ fn every_program_comes_to_its_quiet_end() {
 }
 
 #[test]
-fn an_error_that_nobody_reads_keeps_its_exit_code() {
+fn an_error_without_a_reader_keeps_its_exit_code() {
     for (program, arguments, code) in [
         ("sim-replay", ["recover", "/no/recording.mcap", "--out=/no/whole.mcap"], 2),
         ("ego-fuser", ["eval", "--weights=/no/weights.safetensors", "--data=/no/scene"], 2),

@@ -1,4 +1,4 @@
-//! What `v2vloc` says, and with which exit code, when something is missing or wrong.
+//! Error messages and exit codes of `v2vloc` for missing and invalid input.
 
 use std::fs;
 use std::net::TcpListener;
@@ -8,13 +8,13 @@ use std::process::Command;
 use tests::fleet::{programs, write_scenario};
 use tests::locks::exclusive_lock;
 
-/// RunScope `v2vloc up` and returns exit code and standard error.
+/// Runs `v2vloc up` and returns exit code and standard error.
 fn up(program: &Path, folder: &Path, scenario: &Path) -> (Option<i32>, String) {
     let output = Command::new(program).arg("up").arg(scenario).arg("--runs").arg(folder.join("runs")).output().unwrap();
     (output.status.code(), String::from_utf8_lossy(&output.stderr).into_owned())
 }
 
-/// As [`up`], with the program under test.
+/// Like [`up`], with the program under test.
 fn refused(folder: &Path, scenario: &Path) -> (Option<i32>, String) {
     up(&programs().join("v2vloc"), folder, scenario)
 }
@@ -23,9 +23,20 @@ fn refused(folder: &Path, scenario: &Path) -> (Option<i32>, String) {
 fn a_misspelt_field_is_named_with_file_and_line() {
     let folder = tempfile::tempdir().unwrap();
     let scenario = write_scenario(folder.path(), 1, "", "ego:\n  dedline_ms: 5");
-    let (code, said) = refused(folder.path(), &scenario);
-    assert_eq!(code, Some(2), "{said}");
-    assert!(said.contains("scenario.yaml:6") && said.contains("dedline_ms"), "{said}");
+    let (code, stderr) = refused(folder.path(), &scenario);
+    assert_eq!(code, Some(2), "{stderr}");
+    assert!(stderr.contains("scenario.yaml:6") && stderr.contains("dedline_ms"), "{stderr}");
+}
+
+#[test]
+fn options_of_a_protocol_that_other_fields_choose_are_named() {
+    let folder = tempfile::tempdir().unwrap();
+    for (option, value) in [("max_agents", "3"), ("ego", "unit"), ("agents", "vehicles")] {
+        let scenario = write_scenario(folder.path(), 1, "", &format!("protocol:\n  {option}: {value}"));
+        let (code, stderr) = refused(folder.path(), &scenario);
+        assert_eq!(code, Some(2), "{stderr}");
+        assert!(stderr.contains(&format!("{option}: choose by scene.agents and ego.id instead")), "{stderr}");
+    }
 }
 
 #[test]
@@ -33,9 +44,9 @@ fn missing_weights_are_named() {
     let folder = tempfile::tempdir().unwrap();
     let scenario = write_scenario(folder.path(), 1, "", "");
     fs::remove_file(folder.path().join("weights.safetensors")).unwrap();
-    let (code, said) = refused(folder.path(), &scenario);
-    assert_eq!(code, Some(2), "{said}");
-    assert!(said.contains("models.weights") && said.contains("weights.safetensors does not exist"), "{said}");
+    let (code, stderr) = refused(folder.path(), &scenario);
+    assert_eq!(code, Some(2), "{stderr}");
+    assert!(stderr.contains("models.weights") && stderr.contains("weights.safetensors does not exist"), "{stderr}");
 }
 
 #[test]
@@ -45,9 +56,9 @@ fn cut_off_weights_are_named() {
     let weights = folder.path().join("weights.safetensors");
     let whole = fs::read(&weights).unwrap();
     fs::write(&weights, &whole[..whole.len() / 2]).unwrap();
-    let (code, said) = refused(folder.path(), &scenario);
-    assert_eq!(code, Some(2), "{said}");
-    assert!(said.contains("weights.safetensors: not a whole safetensors file"), "{said}");
+    let (code, stderr) = refused(folder.path(), &scenario);
+    assert_eq!(code, Some(2), "{stderr}");
+    assert!(stderr.contains("weights.safetensors: not a complete safetensors file"), "{stderr}");
 }
 
 #[test]
@@ -59,18 +70,18 @@ fn a_scene_without_frames_is_refused() {
             fs::remove_file(entry.unwrap().path()).unwrap();
         }
     }
-    let (code, said) = refused(folder.path(), &scenario);
-    assert_eq!(code, Some(2), "{said}");
-    assert!(said.contains(&folder.path().join("scene").display().to_string()), "{said}");
+    let (code, stderr) = refused(folder.path(), &scenario);
+    assert_eq!(code, Some(2), "{stderr}");
+    assert!(stderr.contains(&folder.path().join("scene").display().to_string()), "{stderr}");
 }
 
 #[test]
 fn a_vehicle_that_is_not_there_is_named() {
     let folder = tempfile::tempdir().unwrap();
     let scenario = write_scenario(folder.path(), 1, "agents: ['4279', '77']", "");
-    let (code, said) = refused(folder.path(), &scenario);
-    assert_eq!(code, Some(2), "{said}");
-    assert!(said.contains("scene.agents names vehicle 77") && said.contains("4288"), "{said}");
+    let (code, stderr) = refused(folder.path(), &scenario);
+    assert_eq!(code, Some(2), "{stderr}");
+    assert!(stderr.contains("scene.agents names vehicle 77") && stderr.contains("4288"), "{stderr}");
 }
 
 #[test]
@@ -79,9 +90,9 @@ fn a_port_in_use_is_named() {
     let endpoint = format!("tcp/{}", taken.local_addr().unwrap());
     let folder = tempfile::tempdir().unwrap();
     let scenario = write_scenario(folder.path(), 1, "", &format!("network: {{listen: \"{endpoint}\"}}"));
-    let (code, said) = refused(folder.path(), &scenario);
-    assert_eq!(code, Some(1), "{said}");
-    assert!(said.contains(&endpoint) && said.contains("in use"), "{said}");
+    let (code, stderr) = refused(folder.path(), &scenario);
+    assert_eq!(code, Some(1), "{stderr}");
+    assert!(stderr.contains(&endpoint) && stderr.contains("in use"), "{stderr}");
     assert!(!folder.path().join("runs/test").exists(), "the name is free for the next attempt");
 }
 
@@ -91,9 +102,12 @@ fn a_missing_program_is_named() {
     let scenario = write_scenario(folder.path(), 1, "", "");
     let lonely = folder.path().join("v2vloc");
     fs::copy(programs().join("v2vloc"), &lonely).unwrap();
-    let (code, said) = up(&lonely, folder.path(), &scenario);
-    assert_eq!(code, Some(1), "{said}");
-    assert!(said.contains(&folder.path().join("agent").display().to_string()) && said.contains("is missing"), "{said}");
+    let (code, stderr) = up(&lonely, folder.path(), &scenario);
+    assert_eq!(code, Some(1), "{stderr}");
+    assert!(
+        stderr.contains(&folder.path().join("agent").display().to_string()) && stderr.contains("is missing"),
+        "{stderr}"
+    );
 }
 
 #[test]
@@ -101,9 +115,9 @@ fn a_second_run_of_the_same_name_is_refused() {
     let folder = tempfile::tempdir().unwrap();
     let scenario = write_scenario(folder.path(), 1, "", "");
     fs::create_dir_all(folder.path().join("runs/test")).unwrap();
-    let (code, said) = refused(folder.path(), &scenario);
-    assert_eq!(code, Some(2), "{said}");
-    assert!(said.contains("runs/test exists already"), "{said}");
+    let (code, stderr) = refused(folder.path(), &scenario);
+    assert_eq!(code, Some(2), "{stderr}");
+    assert!(stderr.contains("runs/test exists already"), "{stderr}");
 }
 
 #[test]
@@ -112,7 +126,7 @@ fn an_agent_that_never_comes_is_named() {
     let folder = tempfile::tempdir().unwrap();
     let rest = "remote_agents: ['4288']\ntimeouts: {ready_s: 3}";
     let scenario = write_scenario(folder.path(), 1, "", rest);
-    let (code, said) = refused(folder.path(), &scenario);
-    assert_eq!(code, Some(1), "{said}");
-    assert!(said.contains("not ready") && said.contains("agent-4288"), "{said}");
+    let (code, stderr) = refused(folder.path(), &scenario);
+    assert_eq!(code, Some(1), "{stderr}");
+    assert!(stderr.contains("not ready") && stderr.contains("agent-4288"), "{stderr}");
 }

@@ -6,29 +6,29 @@ use std::process::Command;
 
 use tests::fleet::programs;
 
-/// The words of every command line in the files that start processes, program and subcommand first.
+/// Program and arguments of every command line in the files that start processes, the subcommand first.
 fn commands(folder: &Path) -> Vec<(String, Vec<String>)> {
     let mut commands = Vec::new();
     for entry in fs::read_dir(folder.join("systemd")).unwrap() {
         let text = fs::read_to_string(entry.unwrap().path()).unwrap();
         for line in text.lines().filter_map(|line| line.strip_prefix("ExecStart=/opt/v2vloc/bin/")) {
-            let words: Vec<String> = line.split(' ').map(str::to_owned).collect();
-            commands.push((words[0].clone(), words[1..].to_vec()));
+            let arguments: Vec<String> = line.split(' ').map(str::to_owned).collect();
+            commands.push((arguments[0].clone(), arguments[1..].to_vec()));
         }
     }
     let compose = fs::read_to_string(folder.join("compose/compose.yaml")).unwrap();
     let programs = ["v2vloc", "agent", "ego-fuser", "sim-replay"];
     for line in compose.lines().map(|line| line.trim().trim_start_matches("- ").trim_matches('"')) {
         if let Some(list) = line.strip_prefix("command: [") {
-            let words: Vec<String> =
-                list.trim_end_matches(']').split(", ").map(|word| word.trim_matches('"').into()).collect();
-            commands.push((words[0].clone(), words[1..].to_vec()));
+            let arguments: Vec<String> =
+                list.trim_end_matches(']').split(", ").map(|argument| argument.trim_matches('"').into()).collect();
+            commands.push((arguments[0].clone(), arguments[1..].to_vec()));
         } else if programs.contains(&line) {
             commands.push((line.to_owned(), Vec::new()));
-        } else if let Some((_, words)) = commands.last_mut()
-            && (line.starts_with("--") || (words.is_empty() && !line.contains(':')))
+        } else if let Some((_, arguments)) = commands.last_mut()
+            && (line.starts_with("--") || (arguments.is_empty() && !line.contains(':')))
         {
-            words.push(line.to_owned());
+            arguments.push(line.to_owned());
         }
     }
     commands
@@ -43,7 +43,7 @@ fn keys_that_are_not_there_are_named_and_not_tried_again() {
         .arg(format!("--out={}", folder.path().join("recording.mcap").display()))
         .output()
         .unwrap();
-    // The code with which the units do not start a process again.
+    // The exit code for which the units do not restart a process.
     assert_eq!(output.status.code(), Some(2));
     assert!(String::from_utf8_lossy(&output.stderr).contains("ca.pem"), "{output:?}");
 }
@@ -52,14 +52,17 @@ fn keys_that_are_not_there_are_named_and_not_tried_again() {
 fn units_and_containers_start_what_there_is() {
     let commands = commands(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy"));
     assert_eq!(commands.len(), 8, "{commands:?}");
-    for (program, words) in commands {
-        let output = Command::new(programs().join(&program)).args([&words[0], "--help"]).output().unwrap();
+    for (program, arguments) in commands {
+        let output = Command::new(programs().join(&program)).args([&arguments[0], "--help"]).output().unwrap();
         let help = String::from_utf8_lossy(&output.stdout);
-        assert!(output.status.success(), "{program} {}", words[0]);
-        for name in words.iter().filter_map(|word| word.strip_prefix("--")).map(|word| word.split('=').next().unwrap())
+        assert!(output.status.success(), "{program} {}", arguments[0]);
+        for name in arguments
+            .iter()
+            .filter_map(|argument| argument.strip_prefix("--"))
+            .map(|argument| argument.split('=').next().unwrap())
         {
             let is_there = [" ", "\n", "[="].iter().any(|end| help.contains(&format!("--{name}{end}")));
-            assert!(is_there, "{program} {}: --{name}", words[0]);
+            assert!(is_there, "{program} {}: --{name}", arguments[0]);
         }
     }
 }

@@ -19,13 +19,13 @@ use simulator::generate::{Subset, SynthOptions, generate};
 use tests::fixtures::data;
 use tests::fleet::programs;
 
-/// Metres and degrees between two motions.
+/// Difference between two motions, metres and degrees.
 fn off(truth: &Isometry3<f64>, found: &Isometry3<f64>) -> (f64, f64) {
     let off = truth.inv_mul(found);
     (off.translation.vector.norm(), off.rotation.angle().to_degrees())
 }
 
-/// How many voxels of 0.2 m of `target` a moved `source` also has points in.
+/// Number of voxels of 0.2 m of `target` in which a moved `source` has points too.
 fn overlap(target: &PointCloud, source: &PointCloud, target_from_source: &Isometry3<f64>) -> usize {
     let voxels = |cloud: &PointCloud, motion: &Isometry3<f64>| -> HashSet<[i64; 3]> {
         let moved = |&[x, y, z, _]: &[f32; 4]| motion * Point3::new(x, y, z).cast();
@@ -34,8 +34,8 @@ fn overlap(target: &PointCloud, source: &PointCloud, target_from_source: &Isomet
     voxels(target, &Isometry3::identity()).intersection(&voxels(source, target_from_source)).count()
 }
 
-/// Registers a sweep with one taken a moment before. What is known of their motion is itself good to some decimetres
-/// only, so that the sweeps themselves have a say: they must come to lie at least as well.
+/// Registers a sweep with one taken shortly before. Their known motion has an error of some decimetres itself, so the
+/// sweeps are the criterion: after registration they must overlap at least as well.
 fn follow(target: &PointCloud, source: &PointCloud, known: &Isometry3<f64>) {
     let config = IcpConfig::default();
     let planes = IcpTarget::of_sweep(&target.xyzi, &config);
@@ -97,7 +97,7 @@ fn approaches_meet_on_generated_scenes() {
     let scenes = folder.path().join("scenes");
     let options = SynthOptions::new(Subset::V2vdet, 7, scenes.clone());
     generate(&SynthOptions { frames: 3, agents: 2..=2, scenes: 2, ..options }, &|_| {}).unwrap();
-    // A map of the scenes themselves: exact, so that what is wrong would be the registration.
+    // A point cloud map of the scenes themselves: exact, so that any error is one of the registration.
     let config = IcpConfig::default();
     no_map_of_nothing(folder.path());
     let map = Arc::new(read_map(&[&scenes], 1.0, &config).unwrap());
@@ -123,7 +123,7 @@ fn approaches_meet_on_generated_scenes() {
     let [exact, gnss, map, icp, icp_gnss, box_icp, free_align] = &rows[..] else { panic!("{rows:?}") };
     assert!(rows.iter().all(|row| row.pairs == exact.pairs && row.pairs > 0));
     assert!(exact.success_1m == 1.0 && exact.mean_m.unwrap() < 1e-6, "{exact:?}");
-    // Poses weigh some dozen bytes, boxes some hundred, sweeps some ten thousand.
+    // Poses have some dozen bytes, boxes some hundred, sweeps some ten thousand.
     assert!(
         exact.log2_bytes < 7.0 && (6.0..13.0).contains(&free_align.log2_bytes) && icp.log2_bytes > 14.0,
         "{rows:?}"
@@ -152,7 +152,7 @@ fn the_command_compares_recorded_vehicles() {
     };
     let scene = scene.to_str().unwrap();
     let named = format!("noisy={}", source.display());
-    let (code, said, error) = run(&[
+    let (code, stdout, error) = run(&[
         "--data",
         scene,
         "--boxes",
@@ -165,11 +165,11 @@ fn the_command_compares_recorded_vehicles() {
         "--json",
     ]);
     assert_eq!(code, Some(0), "{error}");
-    let rows: Vec<serde_json::Value> = serde_json::from_str(&said).unwrap();
+    let rows: Vec<serde_json::Value> = serde_json::from_str(&stdout).unwrap();
     let of = |method: &str| rows.iter().find(|row| row["method"] == method).unwrap();
     assert_eq!((rows.len(), of("noisy")["pairs"].as_u64()), (3, Some(1)));
-    assert_eq!(of("noisy")["success_1m"], 1.0, "{said}");
-    assert!(of("icp-gnss")["log2_bytes"].as_f64().unwrap() > 14.0, "{said}");
+    assert_eq!(of("noisy")["success_1m"], 1.0, "{stdout}");
+    assert!(of("icp-gnss")["log2_bytes"].as_f64().unwrap() > 14.0, "{stdout}");
 
     let (code, _, error) = run(&["--data", scene, "--method", "free-align"]);
     assert_eq!(code, Some(2), "{error}");

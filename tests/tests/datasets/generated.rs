@@ -1,4 +1,4 @@
-//! Generated scenes, read back like any other dataset.
+//! Generated scenes, read back like any other data set.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -55,7 +55,7 @@ fn frames(folder: &Path) -> Vec<Vec<Frame>> {
     ticks
 }
 
-/// How many points of a sweep lie in an object's box, grown by `margin_m`.
+/// Number of points of a sweep in an object's box, grown by `margin_m`.
 fn points_in(frame: &Frame, object: &Object, margin_m: f64) -> usize {
     let world_from_lidar = frame.world_from_lidar.unwrap().isometry();
     let object_from_lidar = object.world_from_object.isometry().inverse() * world_from_lidar;
@@ -99,7 +99,7 @@ fn what_is_read_back_fits_together() {
         let gnss = frame.gnss_world_from_vehicle.unwrap().isometry();
         let off = gnss.translation.vector - vehicle.translation.vector;
         assert!(off.norm() < 1.0 && off.norm() > 0.0, "{off}");
-        // Moving vehicles are seen up to a sweep before the time of the annotation.
+        // Moving vehicles are measured up to a sweep before the time of the annotation.
         let margin_m = |object: &Object| 0.2 + 0.05 * object.speed_mps.unwrap();
         let hidden = frame.objects.iter().filter(|object| points_in(frame, object, margin_m(object)) == 0).count();
         assert_eq!(hidden, 0, "annotated without a point");
@@ -112,7 +112,7 @@ fn what_is_read_back_fits_together() {
                 if let Some(same) = other.objects.iter().find(|same| same.id == object.id) {
                     assert_eq!(object, same, "two agents, one vehicle");
                 }
-                // An agent as another one sees it is where it says that it is.
+                // The box of an agent in another agent's annotation is at its own pose.
                 if object.id.to_string() == other.cav.as_str() {
                     assert_ne!(frame.cav, other.cav, "an agent lists itself");
                     let off =
@@ -147,7 +147,7 @@ fn scenes_are_as_dense_as_the_real_ones() {
             let attenuated = frame.points.xyzi.iter().all(|&[x, y, z, intensity]| {
                 (intensity - (-0.004 * (x * x + y * y + z * z).sqrt()).exp()).abs() < 0.01
             });
-            assert!(attenuated, "intensity tells the range, as CARLA's does");
+            assert!(attenuated, "intensity is a function of the range, as in CARLA");
         }
     }
     assert!(together * 10 >= pairs * 9, "{together} of {pairs} companions are in range");
@@ -163,7 +163,7 @@ fn radar_sees_what_moves() {
         returns += radar.len();
         for &[x, y, z, red] in &radar.xyzi {
             assert!(x > 0.0 && (y / x).abs() < 1.9 && x.hypot(y).hypot(z) < 154.0, "{x} {y} {z}");
-            // What stands still comes nearer at most as fast as we drive.
+            // Static objects approach at most at the speed of the vehicle.
             let own = frame.speed_mps.unwrap() as f32;
             let velocity = red_to_velocity(red);
             moving += usize::from(velocity < -own - 2.0 || velocity > 2.0);
@@ -173,7 +173,7 @@ fn radar_sees_what_moves() {
 }
 
 #[test]
-fn traversals_of_a_town_differ_and_share_what_stands() {
+fn traversals_of_a_town_differ_and_share_static_objects() {
     let folder = tempfile::tempdir().unwrap();
     let options = SynthOptions {
         traversals: 2,
@@ -233,7 +233,7 @@ fn weather_copies_lie_beside_the_plain_sweep_and_change_nothing_else() {
 }
 
 #[test]
-fn weather_copies_label_what_is_in_the_air() {
+fn weather_copies_label_airborne_points() {
     let folder = tempfile::tempdir().unwrap();
     made(&SynthOptions { frames: 1, copies: vec![Weather::Fog, Weather::Snow], ..v2vdet(42, folder.path()) });
     let files = contents(folder.path());
@@ -268,7 +268,7 @@ fn weather_copies_label_what_is_in_the_air() {
 }
 
 #[test]
-fn a_folder_in_use_is_left_alone() {
+fn a_folder_in_use_is_not_changed() {
     let folder = tempfile::tempdir().unwrap();
     fs::write(folder.path().join("mine.txt"), "keep").unwrap();
     let options = SynthOptions { frames: 1, ..v2vdet(1, folder.path()) };

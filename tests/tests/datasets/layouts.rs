@@ -13,7 +13,7 @@ use serde_json::{Value, json};
 use sim_replay::inspect::inspect;
 use simulator::generate::{SceneLayout, Subset, SynthOptions, generate};
 
-/// Layouts that hold both agents and their boxes, and as what they are read. A line for each.
+/// Layouts that hold both agents and their boxes, with the layout detected by the reader. A line for each.
 const LAYOUTS: [(SceneLayout, Layout); 7] = [
     (SceneLayout::Opv2v, Layout::Opv2v),
     (SceneLayout::V2v4real, Layout::V2v4Real),
@@ -54,7 +54,7 @@ fn every_layout_gives_the_same_average_precision() {
         assert!(dataset.layout == found && dataset.problems.is_empty(), "{layout:?}: {:?}", dataset.problems);
         let found: Vec<Value> = METHODS.map(|method| average_precision(folder.path(), method)).to_vec();
         if expected.is_empty() {
-            // Nothing would be shown by numbers that are zero anyway.
+            // Equality of zeros would show nothing.
             let at_30 = |precision: &Value| precision[0]["0.3"].as_f64().unwrap_or_else(|| panic!("{precision}"));
             assert!(found.iter().all(|precision| at_30(precision) > 0.3), "{found:?}");
             assert_ne!(found[0], found[1]);

@@ -1,10 +1,10 @@
-//! Evaluation of a damaged data set: everything else is judged, what is left out is counted and named, exit code 3.
+//! Evaluation of a damaged data set: the rest is evaluated, omissions are counted and named, exit code 3.
 
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use deploy::experiment::metrics::Metrics;
+use deploy::score::metrics::Metrics;
 use simulator::generate::{Subset, SynthOptions, generate};
 use tests::fleet::programs;
 
@@ -44,12 +44,12 @@ fn eval(dataset: &Path, method: &str) -> (Option<i32>, Metrics, String) {
     let mut command = Command::new(programs().join("v2vloc"));
     command.arg("eval").arg("--dataset").arg(dataset).args(["--weights", WEIGHTS, "--method", method, "--json"]);
     let output = command.output().unwrap();
-    let said = String::from_utf8_lossy(&output.stderr).into_owned();
-    let metrics = serde_json::from_slice(&output.stdout).unwrap_or_else(|error| panic!("{error}: {said}"));
-    (output.status.code(), metrics, said)
+    let stderr = String::from_utf8_lossy(&output.stderr).into_owned();
+    let metrics = serde_json::from_slice(&output.stdout).unwrap_or_else(|error| panic!("{error}: {stderr}"));
+    (output.status.code(), metrics, stderr)
 }
 
-/// The file of the same tick with another ending.
+/// The file of the same tick with another extension.
 fn beside(sweep: &Path, ending: &str) -> PathBuf {
     let stem = sweep.file_stem().unwrap().to_string_lossy();
     sweep.with_file_name(format!("{stem}{ending}"))
@@ -64,8 +64,8 @@ fn truncate(file: &Path) {
 fn a_truncated_cloud_an_absurd_box_and_a_vehicle_that_leaves_cost_only_themselves() {
     let folder = tempfile::tempdir().unwrap();
     let agents = scene(folder.path());
-    let (code, whole, said) = eval(folder.path(), "max");
-    assert_eq!((code, whole.frames), (Some(0), FRAMES as u64), "{said}");
+    let (code, whole, stderr) = eval(folder.path(), "max");
+    assert_eq!((code, whole.frames), (Some(0), FRAMES as u64), "{stderr}");
 
     truncate(&files(&agents[1], ".pcd")[1]);
     let yaml = &files(&agents[0], ".yaml")[2];
@@ -79,13 +79,13 @@ fn a_truncated_cloud_an_absurd_box_and_a_vehicle_that_leaves_cost_only_themselve
         files(&agents[2], suffix)[3..].iter().for_each(|file| fs::remove_file(file).unwrap());
     }
 
-    let (code, metrics, said) = eval(folder.path(), "max");
+    let (code, metrics, stderr) = eval(folder.path(), "max");
     let left_out = &metrics.left_out;
-    assert_eq!((code, metrics.frames), (Some(3), FRAMES as u64), "{said}");
-    assert_eq!((left_out.ticks, left_out.frames, left_out.parts, left_out.absent_frames), (0, 1, 1, 2), "{said}");
-    let named = |name: &Path| said.contains(&*name.to_string_lossy());
-    assert!(named(&files(&agents[0], ".yaml")[2]) && named(&files(&agents[1], ".pcd")[1]), "{said}");
-    assert!(said.contains("absent agents: 2 frames"), "{said}");
+    assert_eq!((code, metrics.frames), (Some(3), FRAMES as u64), "{stderr}");
+    assert_eq!((left_out.ticks, left_out.frames, left_out.parts, left_out.absent_frames), (0, 1, 1, 2), "{stderr}");
+    let named = |name: &Path| stderr.contains(&*name.to_string_lossy());
+    assert!(named(&files(&agents[0], ".yaml")[2]) && named(&files(&agents[1], ".pcd")[1]), "{stderr}");
+    assert!(stderr.contains("absent agents: 2 frames"), "{stderr}");
     assert!(metrics.ap_global.at_30.unwrap() > 0.3, "{:?}", metrics.ap_global);
 }
 
@@ -94,8 +94,8 @@ fn a_tick_whose_ego_cannot_be_read_is_not_judged() {
     let folder = tempfile::tempdir().unwrap();
     let agents = scene(folder.path());
     truncate(&files(&agents[0], ".pcd")[0]);
-    let (code, metrics, said) = eval(folder.path(), "late");
-    assert_eq!((code, metrics.frames, metrics.left_out.ticks), (Some(3), FRAMES as u64 - 1, 1), "{said}");
+    let (code, metrics, stderr) = eval(folder.path(), "late");
+    assert_eq!((code, metrics.frames, metrics.left_out.ticks), (Some(3), FRAMES as u64 - 1, 1), "{stderr}");
 }
 
 #[test]
@@ -108,6 +108,6 @@ fn a_vehicle_that_leaves_is_no_fault() {
             fs::remove_file(file).unwrap();
         }
     }
-    let (code, metrics, said) = eval(folder.path(), "max");
-    assert_eq!((code, metrics.frames, metrics.left_out.absent_frames), (Some(0), FRAMES as u64, 3), "{said}");
+    let (code, metrics, stderr) = eval(folder.path(), "max");
+    assert_eq!((code, metrics.frames, metrics.left_out.absent_frames), (Some(0), FRAMES as u64, 3), "{stderr}");
 }

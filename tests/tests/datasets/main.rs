@@ -1,4 +1,4 @@
-//! Data sets: readers of recorded sweeps, generated scenes in every layout, road maps, alignment, what damaged data leaves.
+//! Data sets: readers of recorded sweeps, generated scenes in every layout, road maps, alignment, damaged data.
 
 mod alignment;
 mod generated;

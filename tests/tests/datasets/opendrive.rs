@@ -1,11 +1,11 @@
-//! CARLA's own maps as towns: counts as in their README, connected lanes, free lanes.
+//! CARLA's own road maps: counts as in their README, connected lanes, free lanes.
 
 use simulator::map::lane_builder::lane_graph;
 use simulator::map::road::RoadNetwork;
 use simulator::map::{LaneGraph, TownSource, build, opendrive};
 use tests::fixtures;
 
-/// How far one should be able to drive from a lane, metres.
+/// Distance that a vehicle should be able to drive from a lane, metres.
 const DRIVE_M: f64 = 3000.0;
 
 struct Expected {
@@ -59,7 +59,7 @@ fn maps_are_read_as_their_readme_counts_them() {
     }
 }
 
-/// Elements of a reference line follow each other in place and heading.
+/// Elements of a reference line follow each other in position and heading.
 fn check_reference_lines(file: &str, network: &RoadNetwork) {
     for road in &network.roads {
         for pair in road.plan_view.windows(2) {
@@ -71,7 +71,7 @@ fn check_reference_lines(file: &str, network: &RoadNetwork) {
     }
 }
 
-/// Lanes follow each other in place and heading, and from nearly every lane one can drive on for kilometres.
+/// Lanes follow each other in position and heading, and from nearly every lane a vehicle can drive on for kilometres.
 fn check_links(file: &str, graph: &LaneGraph) {
     for lane in &graph.lanes {
         let end = lane.centerline[lane.centerline.len() - 1];

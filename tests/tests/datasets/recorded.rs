@@ -1,4 +1,4 @@
-//! Readers on recorded sweeps of other projects, whose notes say what is expected; and a localizer on one of them.
+//! Readers on recorded sweeps of other projects, against the values in their notes; and a localizer on one of them.
 
 use std::collections::HashSet;
 use std::path::Path;
@@ -35,7 +35,7 @@ fn v2xset_scene_is_found_at_every_level() {
         assert_eq!((dataset.layout, dataset.scenarios.len()), (Layout::Opv2v, 1));
         assert_eq!(scenario.agents.iter().map(|id| id.as_str()).collect::<Vec<_>>(), ["4279", "4288"]);
         assert_eq!(scenario.ticks.iter().map(|tick| tick.stem.as_str()).collect::<Vec<_>>(), ["000069"]);
-        // 69 ticks of 0.05 s, as the protocol of the recording says.
+        // 69 ticks of 0.05 s, as in the protocol of the recording.
         assert_eq!(scenario.ticks[0].capture_nanos, 3_450_000_000);
         assert!(scenario.name.ends_with("2021_08_21_17_30_41"), "{}", scenario.name);
     }
@@ -45,13 +45,13 @@ fn v2xset_scene_is_found_at_every_level() {
 
 #[test]
 #[ignore = "needs V2V_DATA"]
-fn v2xset_ground_truth_is_21_boxes_alone_and_26_together() {
+fn v2xset_ground_truth_is_21_boxes_ego_only_and_26_together() {
     let [ego, partner] = v2xset_frames();
-    let alone = ground_truth::merge(&[&ego], 0, &GroundTruthRule::OPV2V);
+    let ego_only = ground_truth::merge(&[&ego], 0, &GroundTruthRule::OPV2V);
     let together = ground_truth::merge(&[&ego, &partner], 0, &GroundTruthRule::OPV2V);
-    assert_eq!((alone.len(), together.len()), (21, 26));
+    assert_eq!((ego_only.len(), together.len()), (21, 26));
     let lists_ego = |merged: &[(i64, protocol::Box3d)]| merged.iter().any(|(id, _)| *id == 4279);
-    assert!(!lists_ego(&alone) && lists_ego(&together), "4288 lists the ego, the ego never lists itself");
+    assert!(!lists_ego(&ego_only) && lists_ego(&together), "4288 lists the ego, the ego never lists itself");
     assert_eq!((ego.objects.len(), partner.objects.len()), (21, 22));
     let ego_box = together.iter().find(|(id, _)| *id == 4279).unwrap().1;
     assert!(ego_box.center_m[0].hypot(ego_box.center_m[1]) < 1.0, "{ego_box:?}");
@@ -65,7 +65,7 @@ fn v2xset_sweeps_have_their_points_and_intensities() {
         assert_eq!((frame.points.len(), frame.dropped_points), (points, 0));
         for &[x, y, z, intensity] in &frame.points.xyzi {
             assert!((158.0 / 255.0..=253.0 / 255.0).contains(&intensity));
-            // CARLA's attenuation: intensity says how far the point is, and nothing else.
+            // CARLA's attenuation: intensity is a function of the range, and of nothing else.
             let range = x.hypot(y).hypot(z);
             assert!((intensity - (-0.004 * range).exp()).abs() < 0.0025, "{intensity} at {range} m");
         }
@@ -89,7 +89,7 @@ fn v2xset_poses_are_47_metres_apart_and_gnss_is_near() {
     }
 }
 
-/// How many of a frame's points lie in an object's box.
+/// Number of a frame's points in an object's box.
 fn points_inside(frame: &Frame, object: &Object) -> usize {
     let object_from_lidar = object.world_from_object.isometry().inverse() * frame.world_from_lidar.unwrap().isometry();
     let half = object.size_m.map(|size| size / 2.0);
@@ -205,7 +205,7 @@ fn binary_pcd_pair_overlaps_by_its_relative_pose() {
     assert!((0.0..=255.0).contains(&highest) && highest > 1.0, "intensity is as stored: {highest}");
 
     let text = std::fs::read_to_string(dir.join("relative.txt")).unwrap();
-    let numbers: Vec<f64> = text.split_whitespace().map(|word| word.parse().unwrap()).collect();
+    let numbers: Vec<f64> = text.split_whitespace().map(|number| number.parse().unwrap()).collect();
     let first_from_second =
         protocol::Pose::from_matrix(&nalgebra::Matrix4::from_row_slice(&numbers)).unwrap().isometry();
     let voxels = |cloud: &pcd::PcdCloud, moved: &nalgebra::Isometry3<f64>| -> HashSet<[i64; 3]> {
@@ -252,7 +252,7 @@ fn a_real_sweep_passes_through_the_shipped_networks_and_is_placed_nowhere() {
     let (coordinates, _) = localizer.scene_coordinates(&frame.points).unwrap();
     assert!(coordinates.sensor_m.len() > 100, "{} cells", coordinates.sensor_m.len());
     assert!(coordinates.world_m.iter().flatten().chain(&coordinates.epsilon_m).all(|number| number.is_finite()));
-    // It was made in a town that is not the head's.
+    // Recorded in another town than that of the head.
     let estimate = localizer.localize(&frame.points).unwrap().estimate;
     assert!(estimate.confidence() < 0.1, "{estimate:?}");
 }

@@ -1,5 +1,5 @@
-//! Damaged inputs through every reader: no panic, and no memory taken for a length that only a header claims.
-//! `cargo bench -p tests --bench mutation` is the long one.
+//! Damaged inputs through every reader: no panic, and no memory allocated for a length that only a header claims.
+//! `cargo bench -p tests --bench mutation` is the long run.
 
 use dataset::pcd;
 use tests::locks::exclusive_lock;
@@ -19,7 +19,7 @@ fn check(reports: impl IntoIterator<Item = Report>) {
     }
 }
 
-/// Peak of memory while `read` runs, bytes; the least of three times, as the test harness has threads of its own.
+/// Peak of memory during `read`, bytes; the least of three runs, as the test harness has threads of its own.
 fn peak_bytes(read: impl Fn()) -> usize {
     let once = |_| {
         MEMORY.reset_peak_usage();
@@ -70,7 +70,7 @@ fn a_cloud_takes_memory_by_its_bytes_and_not_by_its_header() {
             let mut file =
                 format!("FIELDS x y z _\nSIZE {sizes}\nTYPE U U U U\nCOUNT {counts}\nWIDTH 50000000\nDATA {data}\n")
                     .into_bytes();
-            // Lengths of what is packed, should it be: a few bytes that claim to become 150 MB.
+            // Lengths of compressed data, if it is compressed: a few bytes that claim to become 150 MB.
             file.extend(8_u32.to_le_bytes());
             file.extend(150_000_000_u32.to_le_bytes());
             file.extend([0; 8]);

@@ -1,4 +1,4 @@
-//! What `v2vloc` says, and with which exit code, when a part of a run fails and the rest of it goes on; and what it does not
+//! Reports and exit codes of `v2vloc` when a part of a run fails and the rest goes on, and runs that it refuses to
 //! begin.
 
 use std::fs;
@@ -10,19 +10,19 @@ use recording::Recording;
 use tests::fleet::{Up, programs, results, signal, write_scenario};
 use tests::locks::exclusive_lock;
 
-/// RunScope `program` to its end; exit code and what it says on both outputs.
-fn said(command: &mut Command) -> (Option<i32>, String) {
+/// Runs `program` to its end; exit code and both outputs.
+fn outcome(command: &mut Command) -> (Option<i32>, String) {
     let Output { status, stdout, stderr } = command.stdin(Stdio::null()).output().unwrap();
-    (status.code(), [stdout, stderr].map(|said| String::from_utf8_lossy(&said).into_owned()).concat())
+    (status.code(), [stdout, stderr].map(|bytes| String::from_utf8_lossy(&bytes).into_owned()).concat())
 }
 
 fn up(folder: &Path, scenario: &Path, name: &str) -> (Option<i32>, String) {
     let mut command = Command::new(programs().join("v2vloc"));
-    said(command.arg("up").arg(scenario).arg("--name").arg(name).arg("--runs").arg(folder.join("runs")))
+    outcome(command.arg("up").arg(scenario).arg("--name").arg(name).arg("--runs").arg(folder.join("runs")))
 }
 
 #[test]
-fn a_recording_that_is_cut_is_told_by_report_status_and_exit_code() {
+fn a_cut_recording_is_reported_by_report_status_and_exit_code() {
     let _exclusive = exclusive_lock();
     let folder = tempfile::tempdir().unwrap();
     // A tick of some 200 kB every half second; no file may be larger than 1.5 MB.
@@ -30,21 +30,21 @@ fn a_recording_that_is_cut_is_told_by_report_status_and_exit_code() {
     let limited = "ulimit -f 3000; trap '' XFSZ; exec \"$0\" \"$@\"";
     let mut command = Command::new("/bin/sh");
     command.args(["-c", limited]).arg(programs().join("v2vloc")).arg("up").arg(&scenario);
-    let (code, told) = said(command.arg("--runs").arg(folder.path().join("runs")));
-    assert_eq!(code, Some(3), "{told}");
+    let (code, output) = outcome(command.arg("--runs").arg(folder.path().join("runs")));
+    assert_eq!(code, Some(3), "{output}");
     let run = folder.path().join("runs/test");
     let recording = run.join("recording.mcap");
     let advice = format!("messages missing; sim-replay recover {} --out ", recording.display());
-    for word in ["recorder: recording cut at ", " s: ", &advice] {
-        assert_eq!(told.matches(word).count(), 2, "at once, and in the report: {told}");
+    for text in ["recorder: recording cut at ", " s: ", &advice] {
+        assert_eq!(output.matches(text).count(), 2, "at once, and in the report: {output}");
     }
     assert_eq!(results(&run).len(), 14, "the run goes on");
-    let (code, status) = said(Command::new(programs().join("v2vloc")).arg("status").arg(&run));
+    let (code, status) = outcome(Command::new(programs().join("v2vloc")).arg("status").arg(&run));
     assert!(code == Some(1) && status.contains("recorder is") && status.contains("recording cut at"), "{status}");
     let whole = run.join("whole.mcap");
     let recover = ["recover".as_ref(), recording.as_os_str(), "--out".as_ref(), whole.as_os_str()];
-    let (code, told) = said(Command::new(programs().join("sim-replay")).args(recover));
-    assert!(code == Some(3) && told.contains("ends without an index"), "{told}");
+    let (code, output) = outcome(Command::new(programs().join("sim-replay")).args(recover));
+    assert!(code == Some(3) && output.contains("ends without an index"), "{output}");
     let [cut, whole] = [&recording, &whole].map(|file| Recording::open(file).unwrap());
     assert!(!whole.entries().is_empty() && whole.entries().len() == cut.entries().len());
     assert_eq!(whole.damage(), []);
@@ -61,20 +61,20 @@ fn a_second_fleet_of_the_same_name_is_refused_and_the_first_goes_on() {
     let mut first = Up::start(folder.path(), &scenario);
     first.wait_for_results("a result", |results| !results.is_empty());
     let others = folder.path().join("others");
-    let (code, told) = up(&others, &joining, "test");
-    assert_eq!(code, Some(2), "{told}");
-    assert!(told.contains(&format!("run test is already live on tcp/{free}")), "{told}");
+    let (code, output) = up(&others, &joining, "test");
+    assert_eq!(code, Some(2), "{output}");
+    assert!(output.contains(&format!("run test is already live on tcp/{free}")), "{output}");
     for process in ["agent-4279", "agent-4288", "ego-4279", "replay", "scorer"] {
-        assert!(told.contains(process), "{process}: {told}");
+        assert!(output.contains(process), "{process}: {output}");
     }
     assert!(!others.join("runs/test").exists(), "nothing of it began");
-    let heard = results(&first.folder).len();
-    first.wait_for_results("the first going on", |results| results.len() > heard + 3);
+    let before = results(&first.folder).len();
+    first.wait_for_results("the first going on", |results| results.len() > before + 3);
     signal(first.pid(), "INT");
     assert!(matches!(first.wait().code(), Some(0 | 3)));
 }
 
-/// Takes the poses out of all files of the scene.
+/// Removes the poses from all files of the scene.
 fn without_poses(scene: &Path) {
     for agent in fs::read_dir(scene).unwrap() {
         for file in fs::read_dir(agent.unwrap().path()).unwrap().map(|file| file.unwrap().path()) {
@@ -94,9 +94,12 @@ fn a_scene_without_poses_is_played_to_those_who_find_theirs() {
     let folder = tempfile::tempdir().unwrap();
     let recorded = write_scenario(folder.path(), 4, "lockstep: true", "");
     without_poses(&folder.path().join("scene"));
-    let (code, told) = up(folder.path(), &recorded, "recorded");
-    assert_eq!(code, Some(2), "{told}");
-    assert!(told.contains("vehicle 4279: pose is recorded, but scenario") && told.contains("pose: pgc"), "{told}");
+    let (code, output) = up(folder.path(), &recorded, "recorded");
+    assert_eq!(code, Some(2), "{output}");
+    assert!(
+        output.contains("vehicle 4279: pose is recorded, but scenario") && output.contains("pose: pgc"),
+        "{output}"
+    );
     assert!(!folder.path().join("runs/recorded").exists());
 
     tests::localizer::write(folder.path(), 3);
@@ -104,9 +107,9 @@ fn a_scene_without_poses_is_played_to_those_who_find_theirs() {
     let pose = "agents: {pose: {pgc: {encoder: encoder.safetensors, head: head.safetensors}}}\n";
     let finding = folder.path().join("finding.yaml");
     fs::write(&finding, text + pose).unwrap();
-    let (code, told) = up(folder.path(), &finding, "finding");
-    // Networks that have learnt nothing find no pose, and maps without one cannot be used.
-    assert!(matches!(code, Some(0 | 3)), "{told}");
+    let (code, output) = up(folder.path(), &finding, "finding");
+    // Untrained networks find no pose, and feature maps without one cannot be used.
+    assert!(matches!(code, Some(0 | 3)), "{output}");
     let results = results(&folder.path().join("runs/finding"));
     let ticks: Vec<_> = results.iter().map(|result| result["tick"].as_u64()).collect();
     assert_eq!(ticks, [0, 1, 2, 3].map(Some), "every tick is answered");
@@ -114,12 +117,12 @@ fn a_scene_without_poses_is_played_to_those_who_find_theirs() {
     let weights = folder.path().join("weights.safetensors");
     let mut eval = Command::new(programs().join("v2vloc"));
     eval.args(["eval", "--method", "max", "--dataset"]).arg(folder.path().join("scene")).arg("--weights").arg(weights);
-    let (code, told) = said(&mut eval);
-    assert!(code == Some(2) && told.contains("no true poses of the ego 4279"), "{told}");
+    let (code, output) = outcome(&mut eval);
+    assert!(code == Some(2) && output.contains("no true poses of the ego 4279"), "{output}");
 }
 
 #[test]
-fn sweeps_alone_are_localised_and_no_sweep_is_an_error() {
+fn sweeps_without_poses_are_localised_and_no_sweep_is_an_error() {
     let folder = tempfile::tempdir().unwrap();
     tests::scene::write(folder.path(), &["4279"], 2);
     let (encoder, head) = tests::localizer::write(folder.path(), 3);
@@ -135,13 +138,13 @@ fn sweeps_alone_are_localised_and_no_sweep_is_an_error() {
         agent
     };
     let table = folder.path().join("poses.csv");
-    let (code, told) = said(agent("localize", &scene).arg("--out").arg(&table));
-    assert!(code == Some(0) && told.contains("2 sweeps, "), "{told}");
-    let (code, told) = said(&mut agent("eval", &scene));
-    assert!(code == Some(2) && told.contains("no true pose to compare with"), "{told}");
+    let (code, output) = outcome(agent("localize", &scene).arg("--out").arg(&table));
+    assert!(code == Some(0) && output.contains("2 sweeps, "), "{output}");
+    let (code, output) = outcome(&mut agent("eval", &scene));
+    assert!(code == Some(2) && output.contains("no true pose to compare with"), "{output}");
     let empty = folder.path().join("empty/1");
     fs::create_dir_all(&empty).unwrap();
-    let (code, told) =
-        said(agent("localize", empty.parent().unwrap()).arg("--out").arg(folder.path().join("none.csv")));
-    assert_eq!(code, Some(2), "{told}");
+    let (code, output) =
+        outcome(agent("localize", empty.parent().unwrap()).arg("--out").arg(folder.path().join("none.csv")));
+    assert_eq!(code, Some(2), "{output}");
 }

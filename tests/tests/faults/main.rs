@@ -6,6 +6,6 @@ mod processes;
 
 use peak_alloc::PeakAlloc;
 
-/// Counts memory for `damaged_inputs`; an allocator belongs to the whole program.
+/// Counts memory for `damaged_inputs`; an allocator is global to the program.
 #[global_allocator]
 static MEMORY: PeakAlloc = PeakAlloc;

@@ -1,4 +1,5 @@
-//! A fleet under faults: whatever happens to its processes, its cables and its router, it goes on and accounts for it.
+//! Fleet under faults: after any fault of its processes, virtual links or router, it goes on and accounts for all
+//! messages.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -46,7 +47,7 @@ fn a_fleet_that_lasts_opens_nothing_more_and_more() {
     }
 }
 
-/// A file system of its own with room for so many KiB, while this lives.
+/// A file system of its own with room for so many KiB, until dropped.
 struct SmallDisk(PathBuf);
 
 impl SmallDisk {
@@ -74,12 +75,15 @@ fn a_full_disk_ends_no_run_and_takes_no_result_with_it() {
     let scenario = write_scenario(folder.path(), 60, "rate: 2", "");
     let run = Command::new(programs().join("v2vloc")).arg("up").arg(&scenario).arg("--runs").arg(&disk.0).output();
     let output = run.unwrap();
-    let [told, said] = [&output.stdout, &output.stderr].map(|bytes| String::from_utf8_lossy(bytes));
-    assert_eq!(output.status.code(), Some(3), "{told}{said}");
-    assert!(told.contains("every message is accounted for"), "{told}{said}");
-    assert!(told.contains("unwritten cannot write") && told.contains("metrics.json: No space left"), "{told}{said}");
-    let answered = told.lines().nth(1).and_then(|row| row.split_whitespace().nth(2)?.split_once('/')?.0.parse().ok());
-    assert!(answered.is_some_and(|answered: u32| answered > 40), "{told}{said}");
-    assert_eq!(said.matches("detections.jsonl waits").count(), 1, "said once: {said}");
+    let [stdout, stderr] = [&output.stdout, &output.stderr].map(|bytes| String::from_utf8_lossy(bytes));
+    assert_eq!(output.status.code(), Some(3), "{stdout}{stderr}");
+    assert!(stdout.contains("every message is accounted for"), "{stdout}{stderr}");
+    assert!(
+        stdout.contains("unwritten cannot write") && stdout.contains("metrics.json: No space left"),
+        "{stdout}{stderr}"
+    );
+    let answered = stdout.lines().nth(1).and_then(|row| row.split_whitespace().nth(2)?.split_once('/')?.0.parse().ok());
+    assert!(answered.is_some_and(|answered: u32| answered > 40), "{stdout}{stderr}");
+    assert_eq!(stderr.matches("detections.jsonl waits").count(), 1, "reported once: {stderr}");
     assert!(!disk.0.join("test/metrics.json").exists(), "half a file is worse than none");
 }

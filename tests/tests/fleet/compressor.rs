@@ -1,4 +1,5 @@
-//! A learnt compressor between vehicles: its code crosses the air, and the ego sees what it would have seen of the whole map.
+//! Learnt compressor between vehicles: its code is transmitted, and the ego detects what it would from the compressor's
+//! output.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -38,14 +39,14 @@ fn topic(name: &str, stream: Stream) -> Topic {
     Topic::Stream { cav: cav(name), stream }
 }
 
-/// A weights file of a network that believes in vehicles, the same in everything but its compressor.
+/// A weights file of a network that detects vehicles everywhere, the same in everything but its compressor.
 fn weights_file(folder: &Path, compress_ratio: Option<i64>) -> PathBuf {
     let lidar_range_m = [-25.6, -12.8, -3.0, 25.6, 12.8, 1.0];
     let config = DetectorConfig { lidar_range_m, compress_ratio, ..DetectorConfig::lean() };
     let fusion = Method::MAX.default_fusion(&config);
     let model = CooperativeModel::with_fusion(&config, Method::MAX, &fusion, Device::Cpu).unwrap();
     for (name, mut variable) in model.variables.variables() {
-        // Values from the shape alone.
+        // Values from the shape only.
         let count = variable.numel() as i64;
         let wave = (Tensor::arange(count, (Kind::Float, Device::Cpu)) * 0.7).sin().view(variable.size().as_slice());
         let new = match name.as_str() {
@@ -67,7 +68,7 @@ fn agent(name: &str, weights: &Path) -> Agent {
     Agent::new(cav(name), Box::new(RecordedPose), Detector::load(weights).unwrap())
 }
 
-/// Without any network: boxes of every tick, and the bytes of a neighbour's map.
+/// Without any network: boxes of every tick, and the bytes of a neighbour's feature map.
 fn offline(folder: &Path, weights: &Path) -> (Vec<Vec<Detection>>, u64) {
     let scenario = dataset::open(folder).unwrap().scenarios.remove(0);
     let mut agents = AGENTS.map(|name| agent(name, weights));
@@ -93,7 +94,7 @@ fn offline(folder: &Path, weights: &Path) -> (Vec<Vec<Detection>>, u64) {
     (results, bytes)
 }
 
-/// Over real sessions, in step with the ego, the neighbour with weights of its own; and everybody's books.
+/// Over real sessions, in step with the ego, the neighbour with weights of its own; and the sum of all ledgers.
 fn live(folder: &Path, weights: &Path, of_neighbour: &Path) -> (Vec<Detections>, Ledger) {
     let scenario = dataset::open(folder).unwrap().scenarios.remove(0);
     let (router, stop) = (TestRouter::open(), Stop::new());
@@ -115,9 +116,9 @@ fn live(folder: &Path, weights: &Path, of_neighbour: &Path) -> (Vec<Detections>,
             let bus = router.join("ego-10", "10");
             let options = ego_node::NodeOptions { deadline: PATIENCE, ..ego_node::NodeOptions::default() };
             ego_node::run(&bus, &cav("10"), ego, &options, &own_stop).unwrap();
-            let books = bus.books().clone();
+            let stats = bus.books().clone();
             bus.leave(PATIENCE).unwrap();
-            books.ledger()
+            stats.ledger()
         });
         let replay = router.join("replay", "replay");
         let to_ego = AGENTS.map(|name| (topic(name, Stream::Bev), "ego-10"));
@@ -144,7 +145,7 @@ fn live(folder: &Path, weights: &Path, of_neighbour: &Path) -> (Vec<Detections>,
 }
 
 #[test]
-fn the_code_crosses_the_air_and_offline_and_live_see_the_same_boxes() {
+fn the_code_is_transmitted_and_offline_and_live_detect_the_same_boxes() {
     tch::set_num_threads(1);
     let folder = tempfile::tempdir().unwrap();
     scene::write(folder.path(), &AGENTS, TICKS);
@@ -176,7 +177,7 @@ fn a_map_of_another_compressor_is_left_out_by_its_shape() {
 }
 
 #[test]
-fn the_message_of_a_code_says_what_it_stands_for() {
+fn the_message_of_a_code_names_its_channels() {
     tch::set_num_threads(1);
     let folder = tempfile::tempdir().unwrap();
     let mut agent = agent("10", &weights_file(folder.path(), Some(16)));

@@ -1,4 +1,4 @@
-//! A fleet through real zenoh sessions: replay, agents and ego in one process, each on a session of its own.
+//! Fleet through real zenoh sessions: replay, agents and ego in one process, each with a session of its own.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -47,15 +47,15 @@ fn topic(cav_id: &str, stream: Stream) -> Topic {
     Topic::Stream { cav: cav(cav_id), stream }
 }
 
-/// What `build` makes, with the same random parameters every time.
+/// Builds a network with the same random parameters every time.
 fn seeded<T>(build: impl FnOnce() -> T) -> T {
-    // The seed is that of the whole process: nobody else may draw between it and the last parameter.
+    // The seed is that of the whole process: no other test may draw between it and the last parameter.
     let _generator = random_generator_lock();
     tch::manual_seed(5);
     build()
 }
 
-/// A network with a head that believes in vehicles everywhere.
+/// A network with a head that detects vehicles everywhere.
 fn network() -> Detector {
     let config = DetectorConfig { lidar_range_m: [-25.6, -12.8, -3.0, 25.6, 12.8, 1.0], ..DetectorConfig::lean() };
     let network = VarStore::new(Device::Cpu);
@@ -85,7 +85,7 @@ fn published(method: Method) -> Stream {
     }
 }
 
-/// RunScope an agent on a session of its own until `stop`; gives its books.
+/// Runs an agent on a session of its own until `stop`; returns its ledger.
 fn run_agent<'scope>(
     scope: &'scope Scope<'scope, '_>,
     router: &'scope TestRouter,
@@ -105,13 +105,13 @@ fn run_agent<'scope>(
 }
 
 fn leave(bus: Bus) -> Ledger {
-    let books = bus.books().clone();
+    let stats = bus.books().clone();
     bus.leave(PATIENCE).unwrap();
-    books.ledger()
+    stats.ledger()
 }
 
-/// Listens to an ego's detections until it ends.
-fn listen<'scope>(
+/// Receives an ego's detections until it ends.
+fn collect<'scope>(
     scope: &'scope Scope<'scope, '_>,
     router: &'scope TestRouter,
     ego: &'static str,
@@ -137,18 +137,18 @@ fn listen<'scope>(
     })
 }
 
-/// Who has a part in a method: alone the ego needs nobody's maps but its own.
+/// Vehicles with a part in a method: ego-only methods need no other.
 fn taking_part(method: Method) -> &'static [&'static str] {
     if method == Method::NONE { &AGENTS[..1] } else { &AGENTS }
 }
 
-/// Plays the scene in step with the ego, whose neighbours keep within `rate`; gives what the ego told and everyone's books
-/// added up.
+/// Plays the scene in step with the ego, whose neighbours keep within `rate`; returns the ego's results and the sum of
+/// all ledgers.
 fn play_in_lockstep(dir: &Path, method: Method, rate: RateConfig) -> (Vec<(u64, Detections)>, Ledger) {
     play_and_record(dir, method, rate, None)
 }
 
-/// Writes a run down until `stop`.
+/// Records a run until `stop`.
 fn record<'scope>(
     scope: &'scope Scope<'scope, '_>,
     router: &'scope TestRouter,
@@ -166,7 +166,7 @@ fn record<'scope>(
     })
 }
 
-/// [`play_in_lockstep`], with everything that is said written to a file.
+/// [`play_in_lockstep`], with every message recorded in a file.
 fn play_and_record(
     dir: &Path,
     method: Method,
@@ -177,7 +177,7 @@ fn play_and_record(
     let (router, stop) = (TestRouter::open(), Stop::new());
     let stream = published(method);
     std::thread::scope(|scope| {
-        let listening = listen(scope, &router, "10");
+        let listening = collect(scope, &router, "10");
         let (recorded, ending) = (Stop::new(), Stop::new());
         let recorder = file.map(|file| record(scope, &router, file, &recorded));
         let start = |cav_id: &&'static str| {
@@ -209,8 +209,8 @@ fn play_and_record(
         let mut ledger = leave(replay);
         agents.into_iter().for_each(|agent| ledger.merge(&agent.join().unwrap()));
         ledger.merge(&ego.join().unwrap());
-        let (results, books) = listening.join().unwrap();
-        ledger.merge(&books);
+        let (results, ledger_of_scorer) = listening.join().unwrap();
+        ledger.merge(&ledger_of_scorer);
         recorded.request();
         if let Some(report) = recorder.map(|recorder| recorder.join().unwrap()) {
             assert!(report.is_complete() && report.messages > 0, "{report:?}");
@@ -219,7 +219,7 @@ fn play_and_record(
     })
 }
 
-/// The routes to a recorder that has to hear everything from the beginning.
+/// The routes to a recorder that must receive everything from the beginning.
 fn to_recorder(method: Method, stream: Stream) -> Vec<Route> {
     let streams = [Stream::Lidar, Stream::Gnss, Stream::Pose, stream];
     let vehicles = taking_part(method).iter().flat_map(|cav_id| streams.map(|stream| topic(cav_id, stream)));
@@ -234,11 +234,12 @@ fn a_recorded_run_replayed_gives_the_same_detections() {
     for method in [Method::MAX, Method::LATE] {
         let file = folder.path().join(format!("{method}.mcap"));
         let (live, ledger) = play_and_record(folder.path(), method, RateConfig::default(), Some(&file));
-        assert!(ledger.balance().is_exact(), "{method}: a recorder is in nobody's books");
+        assert!(ledger.balance().is_exact(), "{method}: a recorder is outside the accounting");
         let recording = Recording::open(&file).unwrap();
         assert_eq!(recording.damage(), []);
-        let told = |stream| recording.entries().iter().filter(|entry| entry.key.topic == topic("10", stream)).count();
-        assert_eq!([Stream::Lidar, Stream::Pose, Stream::Detections].map(told), [TICKS; 3], "{method}");
+        let recorded =
+            |stream| recording.entries().iter().filter(|entry| entry.key.topic == topic("10", stream)).count();
+        assert_eq!([Stream::Lidar, Stream::Pose, Stream::Detections].map(recorded), [TICKS; 3], "{method}");
         let (again, _) = play_in_lockstep(&file, method, RateConfig::default());
         assert_eq!(live.len(), again.len(), "{method}");
         assert!(live.iter().any(|(_, result)| !result.detections.is_empty()), "{method}: nothing to compare");
@@ -281,7 +282,7 @@ fn play_offline(scenario: &Scenario, method: Method) -> Vec<(u64, Vec<Detection>
 }
 
 #[test]
-fn live_in_lockstep_equals_offline_bit_by_bit_and_the_books_balance() {
+fn live_in_lockstep_equals_offline_bit_by_bit_and_the_ledgers_balance() {
     let folder = tempfile::tempdir().unwrap();
     scene::write(folder.path(), &AGENTS, TICKS);
     let scenario = dataset::open(folder.path()).unwrap().scenarios.remove(0);
@@ -310,11 +311,11 @@ fn live_in_lockstep_equals_offline_bit_by_bit_and_the_books_balance() {
 }
 
 #[test]
-fn maps_that_keep_within_a_limit_are_fused_and_booked_with_the_reason() {
+fn maps_within_a_limit_are_fused_and_counted_with_the_reason() {
     let folder = tempfile::tempdir().unwrap();
     scene::write(folder.path(), &AGENTS, TICKS);
     let values: i64 = detector().map_shape().iter().product();
-    // Half of what the map takes at a byte per value.
+    // Half of the bytes of the feature map at a byte per value.
     let limit = values as u64 / 2;
     let rate = RateConfig { message_bytes: Some(limit), ..RateConfig::default() };
     let (live, ledger) = play_in_lockstep(folder.path(), Method::MAX, rate);
@@ -328,12 +329,12 @@ fn maps_that_keep_within_a_limit_are_fused_and_booked_with_the_reason() {
         let account = Account::published(topic(cav_id, Stream::Bev));
         ledger.get(&account).unwrap().adapted.clone()
     };
-    assert!(adapted("10").is_empty(), "what the ego's own agent sends does not cross the air");
+    assert!(adapted("10").is_empty(), "the messages of the ego's own agent are not transmitted over the link");
     let fewer = BTreeMap::from([(RateReason::SizeFewerCells, TICKS as u64)]);
     assert!(AGENTS.iter().filter(|cav_id| **cav_id != "10").all(|cav_id| adapted(cav_id) == fewer), "{ledger:?}");
 }
 
-/// Sends a fleet's maps by hand, so that the test decides who is late, wrong or gone.
+/// An agent whose messages the test sends, so that the test decides which are late, wrong or missing.
 struct ScriptedAgent {
     bus: Bus,
     publisher: bus::Publisher,
@@ -368,13 +369,13 @@ impl ScriptedAgent {
         });
     }
 
-    fn wait_until_heard(&self, receiver: &str) {
+    fn wait_for_route(&self, receiver: &str) {
         let route = Route { topic: self.publisher.topic().clone(), receiver: receiver.parse().unwrap() };
         bus::Barrier::new([route]).await_routes(&self.bus).unwrap().wait(PATIENCE).unwrap();
     }
 }
 
-/// What vehicle 10 detects, as a scorer hears it.
+/// Detections of vehicle 10, as received by a scorer.
 struct Results {
     inbox: Arc<Inbox>,
     _subscription: Subscription,
@@ -395,13 +396,13 @@ impl Results {
     }
 }
 
-/// Whose messages a result is made of, beside the ego's own.
+/// Neighbours that a result was fused from.
 fn fused(result: &Detections) -> Vec<&str> {
     result.fused.iter().map(|fused| fused.cav.as_str()).collect()
 }
 
 #[test]
-fn late_killed_and_lying_neighbours_are_named_and_the_ego_goes_on() {
+fn late_killed_and_faulty_neighbours_are_named_and_the_ego_goes_on() {
     let folder = tempfile::tempdir().unwrap();
     scene::write(folder.path(), &AGENTS, TICKS);
     let scenario = dataset::open(folder.path()).unwrap().scenarios.remove(0);
@@ -422,15 +423,15 @@ fn late_killed_and_lying_neighbours_are_named_and_the_ego_goes_on() {
             ego_node::run(&bus, &cav("10"), ego(Method::MAX), &options, &stop).unwrap();
             leave(bus)
         });
-        fleet.iter().for_each(|puppet| puppet.wait_until_heard("ego-10"));
+        fleet.iter().for_each(|agent| agent.wait_for_route("ego-10"));
 
-        // All there.
+        // All present.
         for index in [1, 2, 0] {
             fleet[index].send(&scenario, 0);
         }
         assert_eq!(fused(&results.next()), ["20", "30"]);
 
-        // 30 is late: its message of the tick before is still young enough, and is used with its age.
+        // 30 is late: its message of the tick before is recent enough, and is used with its age.
         fleet[1].send(&scenario, 1);
         fleet[0].send(&scenario, 1);
         let result = results.next();
@@ -452,9 +453,9 @@ fn late_killed_and_lying_neighbours_are_named_and_the_ego_goes_on() {
         let result = results.next();
         assert!(fused(&result).contains(&"30"), "{result:?}");
 
-        // 20 dies without a word.
-        let dead = fleet.remove(1);
-        dead.bus.session().close().wait().unwrap();
+        // 20 crashes.
+        let crashed = fleet.remove(1);
+        crashed.bus.session().close().wait().unwrap();
         for tick in 4..6 {
             fleet[1].send(&scenario, tick);
             fleet[0].send(&scenario, tick);
@@ -489,25 +490,25 @@ fn maps_of_a_network_that_a_neighbour_names_as_another_are_left_out() {
     let ledger = std::thread::scope(|scope| {
         let ego = scope.spawn(|| {
             let bus = router.join("ego-10", "10");
-            // A frame that waited for what is left out would take for ever.
+            // A frame that waited for an excluded neighbour would take for ever.
             let options = ego_node::NodeOptions { deadline: PATIENCE, keeps_running: true, ..Default::default() };
             let report = ego_node::run(&bus, &cav("10"), ego(Method::MAX), &options, &stop).unwrap();
             assert_eq!((report.frames, report.at_deadline), (4, 0));
             leave(bus)
         });
-        fleet.iter().for_each(|puppet| puppet.wait_until_heard("ego-10"));
-        let say = |puppet: &ScriptedAgent, descriptor: Descriptor| {
-            let publisher = puppet.bus.publisher(topic("20", Stream::Descriptor), PublisherOptions::POSE).unwrap();
+        fleet.iter().for_each(|agent| agent.wait_for_route("ego-10"));
+        let describe = |agent: &ScriptedAgent, descriptor: Descriptor| {
+            let publisher = agent.bus.publisher(topic("20", Stream::Descriptor), PublisherOptions::POSE).unwrap();
             publisher.offer(0, descriptor);
-            // It is on its way before the next map is.
+            // It is transmitted before the next map is.
             publisher.finish();
         };
         let send_all = |fleet: &mut [ScriptedAgent], tick| [1, 2, 0].map(|index| fleet[index].send(&scenario, tick));
 
         send_all(&mut fleet, 0);
-        assert_eq!(fused(&results.next()), ["20", "30"], "nothing is known of anybody");
+        assert_eq!(fused(&results.next()), ["20", "30"], "no descriptor has arrived");
 
-        say(&fleet[1], Descriptor { model_hash: ModelHash([9; 32]), ..own.clone() });
+        describe(&fleet[1], Descriptor { model_hash: ModelHash([9; 32]), ..own.clone() });
         for tick in 1..3 {
             send_all(&mut fleet, tick);
             let result = results.next();
@@ -515,12 +516,12 @@ fn maps_of_a_network_that_a_neighbour_names_as_another_are_left_out() {
             assert_eq!((result.skipped[0].cav.as_str(), result.skipped[0].reason), ("20", Some(DropReason::Shape)));
         }
 
-        // It was started again, with the right weights.
+        // It was restarted, with the right weights.
         let restarted = fleet.remove(1);
         restarted.bus.session().close().wait().unwrap();
         fleet.insert(1, ScriptedAgent::new(&router, 1));
-        fleet[1].wait_until_heard("ego-10");
-        say(&fleet[1], own);
+        fleet[1].wait_for_route("ego-10");
+        describe(&fleet[1], own);
         send_all(&mut fleet, 3);
         assert_eq!(fused(&results.next()), ["20", "30"]);
         stop.request();
@@ -529,11 +530,11 @@ fn maps_of_a_network_that_a_neighbour_names_as_another_are_left_out() {
     let from_20 = ledger.get(&Account::towards(topic("20", Stream::Bev), &process_id(protocol::Role::Ego, &cav("10"))));
     let from_20 = from_20.unwrap();
     assert_eq!((from_20.received, from_20.dropped.get(&DropReason::Shape)), (2, Some(&2)), "{from_20:?}");
-    assert!(ledger.iter().all(|(account, _)| account.topic != topic("20", Stream::Descriptor)), "not booked");
+    assert!(ledger.iter().all(|(account, _)| account.topic != topic("20", Stream::Descriptor)), "not counted");
 }
 
 #[test]
-fn an_agent_hears_its_own_sensors_only_and_says_so_when_it_has_no_pose() {
+fn an_agent_receives_its_own_sensors_only_and_reports_a_missing_pose() {
     let folder = tempfile::tempdir().unwrap();
     scene::write(folder.path(), &AGENTS, 3);
     let scenario = dataset::open(folder.path()).unwrap().scenarios.remove(0);
@@ -547,18 +548,18 @@ fn an_agent_hears_its_own_sensors_only_and_says_so_when_it_has_no_pose() {
         let route = Route { topic: topic("20", Stream::Lidar), receiver: "agent-20".parse().unwrap() };
         bus::Barrier::new([route]).await_routes(&replay).unwrap().wait(PATIENCE).unwrap();
         let frame = scenario.load(1, 0, &LoadOptions::default()).unwrap();
-        // A sweep whose pose never comes.
+        // A sweep without a pose.
         other.offer(1, protocol::Lidar { points: frame.points.clone() });
         own.offer(1, protocol::Lidar { points: frame.points });
         other.finish();
         own.finish();
         running.join().unwrap()
     });
-    let heard: BTreeMap<String, u64> = (ledger.iter())
+    let received: BTreeMap<String, u64> = (ledger.iter())
         .filter(|(account, _)| account.to.is_some())
         .map(|(account, counts)| (account.topic.to_string(), counts.received))
         .collect();
-    assert_eq!(heard, BTreeMap::from([("20/gnss".to_owned(), 0), ("20/lidar".to_owned(), 1)]));
+    assert_eq!(received, BTreeMap::from([("20/gnss".to_owned(), 0), ("20/lidar".to_owned(), 1)]));
     let sent = |stream| ledger.get(&Account::published(topic("20", stream))).unwrap().sent;
-    assert_eq!((sent(Stream::Pose), sent(Stream::Bev)), (1, 1), "it says that it has none");
+    assert_eq!((sent(Stream::Pose), sent(Stream::Bev)), (1, 1), "it reports that it has none");
 }

@@ -1,4 +1,4 @@
-//! Poses from the sweep alone, through the programs: a vehicle of a fleet, `agent eval`, and what is wrong with files.
+//! Localization from the sweep only, through the programs: a vehicle of a fleet, `agent eval`, and invalid files.
 
 use std::ffi::OsStr;
 use std::fs;
@@ -12,14 +12,14 @@ use tests::fleet::{Up, programs, results, write_scenario};
 use tests::locks::exclusive_lock;
 use tests::{localizer, scene};
 
-/// RunScope `agent eval` on the scene in `folder`; exit code, standard output and standard error.
+/// Runs `agent eval` on the scene in `folder`; exit code, standard output and standard error.
 fn eval(folder: &Path, encoder: &Path, head: &Path, more: &[&str]) -> (Option<i32>, String, String) {
     let [encoder, head] =
         [("--encoder", encoder), ("--head", head)].map(|(name, file)| [name.as_ref(), file.as_os_str()]);
     eval_with(folder, &[encoder, head].concat(), more)
 }
 
-/// The same of other networks than encoder and head.
+/// The same for other networks than encoder and head.
 fn eval_with(folder: &Path, networks: &[&OsStr], more: &[&str]) -> (Option<i32>, String, String) {
     let output = Command::new(programs().join("agent"))
         .args(["eval", "--scene"])
@@ -38,21 +38,21 @@ fn scene_and_networks(folder: &Path) -> (PathBuf, PathBuf) {
 }
 
 #[test]
-fn a_vehicle_that_finds_no_pose_says_so_and_the_fleet_goes_on() {
+fn a_vehicle_without_a_pose_reports_it_and_the_fleet_goes_on() {
     let _exclusive = exclusive_lock();
     let folder = tempfile::tempdir().unwrap();
     localizer::write(folder.path(), 3);
     let own = "vehicles: {4288: {pose: {pgc: {encoder: encoder.safetensors, head: head.safetensors}}}}";
     let scenario = write_scenario(folder.path(), 4, "lockstep: true", own);
     let mut up = Up::start(folder.path(), &scenario);
-    // The maps of a vehicle that does not know where it is cannot be used, which is not hidden.
+    // The feature maps of a vehicle without a pose cannot be used, which is reported.
     assert_eq!(up.wait().code(), Some(3));
 
     let json =
         |name: &str| -> Value { serde_json::from_str(&fs::read_to_string(up.folder.join(name)).unwrap()).unwrap() };
     let metrics = json("metrics.json");
     assert_eq!(metrics["pose_source"], "mixed");
-    // A network that has learnt nothing has no pose to give; the recorded one of the other vehicle is not touched.
+    // An untrained network has no pose; the recorded one of the other vehicle is not changed.
     assert_eq!(metrics["pose"]["no_pose"], 4, "{}", metrics["pose"]);
     assert_eq!(metrics["pose"]["success_3m"], 0.5);
     assert_eq!(json("ledger.json")["balances"], true);
@@ -74,7 +74,7 @@ fn a_vehicle_whose_network_was_trained_end_to_end_takes_part_with_the_pose_that_
     assert_eq!(up.wait().code(), Some(0));
     let json =
         |name: &str| -> Value { serde_json::from_str(&fs::read_to_string(up.folder.join(name)).unwrap()).unwrap() };
-    // It always has an answer and never doubts it: that is what the localizer is compared with.
+    // It always has a pose with full confidence, which is the comparison with the localizer.
     let metrics = json("metrics.json");
     assert_eq!((&metrics["pose_source"], &metrics["pose"]["no_pose"]), (&"mixed".into(), &0.into()));
     assert_eq!(metrics["pose"]["success_3m"], 0.5, "it has learnt nothing: {}", metrics["pose"]);
@@ -85,28 +85,28 @@ fn a_vehicle_whose_network_was_trained_end_to_end_takes_part_with_the_pose_that_
 }
 
 #[test]
-fn eval_prints_the_numbers_that_others_read_and_writes_what_was_asked_for() {
+fn eval_prints_the_summary_and_writes_the_requested_files() {
     let folder = tempfile::tempdir().unwrap();
     let (encoder, head) = scene_and_networks(folder.path());
     let file = |name: &str| folder.path().join(name);
     let [csv, plot, table] =
         ["sweeps.csv", "reliability.png", "errors.csv"].map(|name| file(name).display().to_string());
     let more = ["--json", "--csv", &csv, "--plot", &plot, "--error-table", &table];
-    let (code, said, complained) = eval(folder.path(), &encoder, &head, &more);
-    assert_eq!(code, Some(0), "{complained}");
-    let summary: Value = serde_json::from_str(&said).unwrap();
+    let (code, output, stderr) = eval(folder.path(), &encoder, &head, &more);
+    assert_eq!(code, Some(0), "{stderr}");
+    let summary: Value = serde_json::from_str(&output).unwrap();
     assert_eq!((&summary["sweeps"], &summary["no_pose"], &summary["success_3m"]), (&8.into(), &8.into(), &0.0.into()));
     for name in ["success_1m", "mean_m", "p50_m", "p95_m", "mean_deg", "p50_deg", "sigma_spearman"] {
-        assert!(summary.get(name).is_some(), "{name}: {said}");
+        assert!(summary.get(name).is_some(), "{name}: {output}");
     }
     assert!(summary["ms"]["total"].as_f64().unwrap() > 0.0 && summary["ms"]["solve"].is_number());
     assert_eq!(fs::read_to_string(csv).unwrap().lines().count(), 9);
     assert_eq!(fs::read_to_string(table).unwrap().lines().filter(|line| *line == "no_pose").count(), 8);
     assert!(fs::read(plot).unwrap().starts_with(b"\x89PNG"));
     // Every second sweep, three of them, as a table.
-    let (code, said, _) =
+    let (code, output, _) =
         eval(folder.path(), &encoder, &head, &["--every", "2", "--sweeps", "3", "--solver", "sc2pcr"]);
-    assert!(code == Some(0) && said.contains("3, 3 without a pose"), "{said}");
+    assert!(code == Some(0) && output.contains("3, 3 without a pose"), "{output}");
 }
 
 #[test]
@@ -117,11 +117,12 @@ fn competitors_are_evaluated_on_the_same_sweeps_with_the_same_numbers() {
     let eval =
         |option: &str, file: &Path, more: &[&str]| eval_with(folder.path(), &[option.as_ref(), file.as_os_str()], more);
     let json = |option: &str, file: &Path| -> Value {
-        let (code, said, complained) = eval(option, file, &["--json"]);
-        assert_eq!(code, Some(0), "{complained}");
-        serde_json::from_str(&said).unwrap()
+        let (code, output, stderr) = eval(option, file, &["--json"]);
+        assert_eq!(code, Some(0), "{stderr}");
+        serde_json::from_str(&output).unwrap()
     };
-    // These sweeps are little but ground, of which few cells are asked; a regressed pose is always told, and never doubted.
+    // These sweeps are mostly ground, of which few cells are used; a regressed pose is always reported, with full
+    // confidence.
     let cells = localizer::write_end_to_end(folder.path(), EndToEndKind::SceneCoordinates, 3);
     let summary = json("--end-to-end", &cells);
     assert_eq!((&summary["sweeps"], &summary["outcomes"]["too_few_points"]), (&8.into(), &8.into()), "{summary}");
@@ -130,15 +131,15 @@ fn competitors_are_evaluated_on_the_same_sweeps_with_the_same_numbers() {
     let summary = json("--end-to-end", &pose);
     assert_eq!((&summary["outcomes"]["pose"], &summary["ms"]["solve"]), (&8.into(), &0.0.into()), "{summary}");
     assert!(summary["mean_m"].as_f64().unwrap() > 0.0 && summary["calibration"][0]["sigma"] == 1.0, "{summary}");
-    // Registration against a map begins where a receiver believes to be, and these vehicles have none.
+    // Registration against a map starts from a pose estimate, and these vehicles have none.
     assert_eq!(json("--icp-map", &scene)["outcomes"]["no_source"], 8);
 
-    let (code, _, complained) = eval("--end-to-end", &encoder, &[]);
-    assert!(code == Some(2) && complained.contains("encoder.safetensors: weights of kind"), "{complained}");
-    let (code, _, complained) = eval("--end-to-end", &pose, &["--fit-confidence"]);
-    assert!(code == Some(2) && complained.contains("cannot be used with"), "{complained}");
-    let (code, _, complained) = eval("--icp-map", &folder.path().join("nowhere"), &[]);
-    assert!(code == Some(2) && complained.contains("nowhere"), "{complained}");
+    let (code, _, stderr) = eval("--end-to-end", &encoder, &[]);
+    assert!(code == Some(2) && stderr.contains("encoder.safetensors: weights of kind"), "{stderr}");
+    let (code, _, stderr) = eval("--end-to-end", &pose, &["--fit-confidence"]);
+    assert!(code == Some(2) && stderr.contains("cannot be used with"), "{stderr}");
+    let (code, _, stderr) = eval("--icp-map", &folder.path().join("nowhere"), &[]);
+    assert!(code == Some(2) && stderr.contains("nowhere"), "{stderr}");
 }
 
 #[test]
@@ -146,8 +147,8 @@ fn a_confidence_needs_poses_to_be_fitted_on() {
     let folder = tempfile::tempdir().unwrap();
     let (encoder, head) = scene_and_networks(folder.path());
     let before = fs::read(&head).unwrap();
-    let (code, _, complained) = eval(folder.path(), &encoder, &head, &["--fit-confidence"]);
-    assert!(code == Some(2) && complained.contains("at least 40 sweeps with a pose, there are 0"), "{complained}");
+    let (code, _, stderr) = eval(folder.path(), &encoder, &head, &["--fit-confidence"]);
+    assert!(code == Some(2) && stderr.contains("at least 40 sweeps with a pose, there are 0"), "{stderr}");
     assert_eq!(fs::read(&head).unwrap(), before, "nothing is written then");
 }
 
@@ -162,18 +163,18 @@ fn files_that_are_wrong_are_named() {
     fs::write(&cut, &whole[..whole.len() / 2]).unwrap();
     let missing = folder.path().join("missing.safetensors");
     for (encoder, head, parts) in [
-        (&encoder, &cut, ["cut.safetensors", "not a whole safetensors file"]),
+        (&encoder, &cut, ["cut.safetensors", "not a complete safetensors file"]),
         (&encoder, &missing, ["missing.safetensors", "No such file"]),
         (&head, &head, ["head.safetensors", "\"scene encoder\""]),
         (&encoder, &encoder, ["encoder.safetensors", "\"scene head\""]),
         (&other_encoder, &head, ["head.safetensors", "trained on encoder"]),
     ] {
-        let (code, _, complained) = eval(folder.path(), encoder, head, &[]);
-        assert_eq!(code, Some(2), "{complained}");
-        assert!(parts.iter().all(|part| complained.contains(part)), "{parts:?}: {complained}");
+        let (code, _, stderr) = eval(folder.path(), encoder, head, &[]);
+        assert_eq!(code, Some(2), "{stderr}");
+        assert!(parts.iter().all(|part| stderr.contains(part)), "{parts:?}: {stderr}");
     }
-    let (code, _, complained) = eval(others.path(), &encoder, &head, &[]);
-    assert!(code == Some(2) && complained.contains("scene"), "{complained}");
+    let (code, _, stderr) = eval(others.path(), &encoder, &head, &[]);
+    assert!(code == Some(2) && stderr.contains("scene"), "{stderr}");
 }
 
 #[test]
@@ -190,14 +191,14 @@ fn an_agent_without_its_networks_does_not_start() {
         (output.status.code(), String::from_utf8_lossy(&output.stderr).into_owned())
     };
     tests::fleet::write_weights(&folder.path().join("weights.safetensors"));
-    let (code, said) = run(&["--pose-source", "pgc"]);
-    assert!(code == Some(2) && said.contains("--encoder"), "{said}");
-    let (code, said) = run(&["--pose-source", "pgc", "--encoder", "/nowhere/e", "--head", "/nowhere/h"]);
-    assert!(code == Some(2) && said.contains("/nowhere/e"), "{said}");
-    let (code, said) = run(&["--pose-source", "end_to_end"]);
-    assert!(code == Some(2) && said.contains("--end-to-end"), "{said}");
-    let (code, said) = run(&["--pose-source", "end_to_end", "--end-to-end", "/nowhere/w"]);
-    assert!(code == Some(2) && said.contains("/nowhere/w"), "{said}");
+    let (code, output) = run(&["--pose-source", "pgc"]);
+    assert!(code == Some(2) && output.contains("--encoder"), "{output}");
+    let (code, output) = run(&["--pose-source", "pgc", "--encoder", "/nowhere/e", "--head", "/nowhere/h"]);
+    assert!(code == Some(2) && output.contains("/nowhere/e"), "{output}");
+    let (code, output) = run(&["--pose-source", "end_to_end"]);
+    assert!(code == Some(2) && output.contains("--end-to-end"), "{output}");
+    let (code, output) = run(&["--pose-source", "end_to_end", "--end-to-end", "/nowhere/w"]);
+    assert!(code == Some(2) && output.contains("/nowhere/w"), "{output}");
 }
 
 #[test]
@@ -210,9 +211,9 @@ fn a_fleet_whose_networks_do_not_fit_is_refused_before_it_starts() {
     let runs = folder.path().join("runs");
     let output = Command::new(programs().join("v2vloc")).arg("up").arg(&scenario).arg("--runs").arg(&runs).output();
     let output = output.unwrap();
-    let said = String::from_utf8_lossy(&output.stderr);
+    let stderr = String::from_utf8_lossy(&output.stderr);
     assert!(
-        output.status.code() == Some(2) && said.contains("localizer: ") && said.contains("head.safetensors"),
-        "{said}"
+        output.status.code() == Some(2) && stderr.contains("localizer: ") && stderr.contains("head.safetensors"),
+        "{stderr}"
     );
 }

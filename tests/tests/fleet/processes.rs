@@ -1,4 +1,4 @@
-//! `v2vloc up` as a person runs it: to the end of a scene, ended by hand, with a vehicle or the launcher killed.
+//! `v2vloc up` as a user runs it: to the end of a scene, interrupted, with a vehicle or the launcher killed.
 
 use std::fs;
 use std::time::{Duration, Instant};
@@ -30,13 +30,13 @@ fn a_fleet_plays_its_scene_and_accounts_for_every_message() {
     assert_eq!((&metrics["frames"], &metrics["method"], &metrics["clock"]), (&6.into(), &"max".into(), &"wall".into()));
     assert_eq!(metrics["pose"]["success_3m"], 1.0);
     assert!(metrics["latency_ms"]["capture_to_detection"]["p50"].as_f64().unwrap() > 0.0);
-    // An f32 map of 8 channels on 64 x 64 cells, and a little more.
+    // An f32 feature map of 8 channels on 64 x 64 cells, and a little more.
     let payload = metrics["comm"]["payload_bytes_mean"].as_f64().unwrap();
     assert!((131_072.0..140_000.0).contains(&payload), "{payload}");
 
     let results = results(run);
     assert_eq!(results.len(), 6);
-    assert!(results.iter().all(|result| fused(result) == 1), "in lockstep nobody is late");
+    assert!(results.iter().all(|result| fused(result) == 1), "in lockstep no message is late");
     let ticks: Vec<_> =
         results.iter().map(|result| (result["tick"].as_u64(), result["agent_frame"].as_u64())).collect();
     assert_eq!(ticks, (0..6).map(|frame| (Some(frame + 2), Some(frame))).collect::<Vec<_>>());
@@ -47,11 +47,11 @@ fn a_fleet_plays_its_scene_and_accounts_for_every_message() {
     assert!(fs::metadata(run.join("frame.png")).unwrap().len() > 1_000);
     let recording = Recording::open(&run.join("recording.mcap")).unwrap();
     assert_eq!(recording.damage(), []);
-    let told = |stream| {
+    let recorded = |stream| {
         let is_it = |topic: &Topic| matches!(topic, Topic::Stream { stream: known, .. } if *known == stream);
         recording.entries().iter().filter(|entry| is_it(&entry.key.topic)).count()
     };
-    assert_eq!([Stream::Lidar, Stream::Detections, Stream::Bev].map(told), [12, 6, 0]);
+    assert_eq!([Stream::Lidar, Stream::Detections, Stream::Bev].map(recorded), [12, 6, 0]);
     for process in ["agent-4279", "agent-4288", "ego-4279", "replay", "recorder"] {
         assert!(run.join(format!("log/{process}.log")).exists(), "{process}");
         assert!(run.join(format!("config/{process}.yaml")).exists(), "{process}");
@@ -62,13 +62,13 @@ fn a_fleet_plays_its_scene_and_accounts_for_every_message() {
 }
 
 #[test]
-fn a_fleet_talks_through_the_emulated_air() {
+fn a_fleet_runs_over_an_emulated_link() {
     let _exclusive = exclusive_lock();
     let folder = tempfile::tempdir().unwrap();
-    // 131 kB at 20 Mbit/s take 53 ms; what follows has to be awaited.
-    let air = "capacity: {token_bucket: {rate_mbps: 20}}\ndelay: {constant_ms: 30}\n";
-    fs::write(folder.path().join("air.yaml"), air).unwrap();
-    let rest = "link: {model: air.yaml}\nego: {deadline_ms: 5000}";
+    // 131 kB at 20 Mbit/s take 53 ms; the next message has to wait.
+    let link = "capacity: {token_bucket: {rate_mbps: 20}}\ndelay: {constant_ms: 30}\n";
+    fs::write(folder.path().join("link.yaml"), link).unwrap();
+    let rest = "link: {model: link.yaml}\nego: {deadline_ms: 5000}";
     let scenario = write_scenario(folder.path(), 4, "lockstep: true", rest);
     let mut up = Up::start(folder.path(), &scenario);
     let status = up.wait();
@@ -80,7 +80,7 @@ fn a_fleet_talks_through_the_emulated_air() {
     assert!(results.len() == 4 && results.iter().all(|result| fused(result) == 1), "all maps came through");
     let metrics = json(&run.join("metrics.json"));
     let latency_ms = metrics["latency_ms"]["capture_to_detection"]["p50"].as_f64().unwrap();
-    assert!(latency_ms > 82.0, "{latency_ms} ms are less than the air takes");
+    assert!(latency_ms > 82.0, "{latency_ms} ms are less than the link takes");
     assert!(run.join("log/link-4279.log").exists());
 }
 
@@ -113,9 +113,9 @@ fn a_killed_agent_is_started_again_and_fused_again() {
     let is_fused = |result: &Value| fused(result) == 1;
     up.wait_for_results("a fused result", |results| results.last().is_some_and(is_fused));
     signal(up.pids()["agent-4288"], "KILL");
-    up.wait_for_results("the ego going on alone", |results| results.last().is_some_and(|last| !is_fused(last)));
-    let fallen = up.wait_for_line("agent-4288 was ended by signal 9");
-    assert!(fallen.contains("starting it again"), "{fallen}");
+    up.wait_for_results("the ego going on without it", |results| results.last().is_some_and(|last| !is_fused(last)));
+    let crashed = up.wait_for_line("agent-4288 was ended by signal 9");
+    assert!(crashed.contains("starting it again"), "{crashed}");
     up.wait_for_results("the agent being fused again", |results| results.last().is_some_and(is_fused));
     signal(up.pid(), "INT");
     assert_eq!(up.wait().code(), Some(3), "what was lost with the agent is not hidden");
@@ -128,17 +128,17 @@ fn a_killed_replay_goes_on_where_it_was() {
     let scenario = write_scenario(folder.path(), 40, "loop: false", "");
     let mut up = Up::start(folder.path(), &scenario);
     up.wait_for_results("five results", |results| results.len() >= 5);
-    let heard = results(&up.folder).len();
+    let before = results(&up.folder).len();
     signal(up.pids()["replay"], "KILL");
-    let fallen = up.wait_for_line("replay was ended by signal 9");
-    assert!(fallen.contains("starting it again"), "{fallen}");
+    let crashed = up.wait_for_line("replay was ended by signal 9");
+    assert!(crashed.contains("starting it again"), "{crashed}");
     let code = up.wait().code();
-    // The tick that was on its way when it fell may be lost; then that is said.
+    // The tick in transit at the crash may be lost; then that is reported.
     let judged = json(&up.folder.join("metrics.json"))["frames"].as_u64().unwrap();
     assert!(judged == 40 && matches!(code, Some(0 | 3)) || judged == 39 && code == Some(3), "{judged}, {code:?}");
     let results = results(&up.folder);
     let capture = |result: &Value| result["capture_nanos"].as_u64().unwrap();
-    assert!(results.len() > heard && results.windows(2).all(|pair| capture(&pair[0]) < capture(&pair[1])));
+    assert!(results.len() > before && results.windows(2).all(|pair| capture(&pair[0]) < capture(&pair[1])));
     assert_eq!(results.last().unwrap()["tick"], 39, "to the end of the scene, which is the run's");
     let ledger = json(&up.folder.join("ledger.json"));
     assert_eq!(ledger["balances"], true, "{}", ledger["balance"]);

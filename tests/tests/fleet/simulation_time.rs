@@ -1,4 +1,4 @@
-//! Virtual time: the same bytes every time, in one process or in several, and the pipelines of a live run.
+//! Simulation time: the same bytes every time, in one process or in several, and the pipelines of a live run.
 
 use std::fs;
 use std::ops::ControlFlow;
@@ -6,7 +6,7 @@ use std::path::Path;
 use std::process::{Command, Output};
 
 use agent::rate::RateConfig;
-use deploy::operate::run_fleet::{RunResult, UpOptions, up};
+use deploy::run::run_fleet::{RunResult, UpOptions, up};
 use deploy::scenario::Scenario;
 use ego_fuser::pairing::PairingConfig;
 use ego_fuser_offline::evaluation::stepped::{AgentPool, ComputeTimes, SteppedConfig};
@@ -22,7 +22,7 @@ use tests::locks::exclusive_lock;
 const TICKS: usize = 8;
 const MS: u64 = 1_000_000;
 
-/// A fleet whose computers take no time, over a link.
+/// A fleet with zero compute times, over a link.
 fn config(link: LinkConfig) -> SteppedConfig {
     SteppedConfig {
         link,
@@ -38,7 +38,7 @@ fn config(link: LinkConfig) -> SteppedConfig {
     }
 }
 
-/// The frames of a scene in `folder`, and the books.
+/// The frames of a scene in `folder`, and the ledger.
 fn evaluate(folder: &Path, stepped: Option<SteppedConfig>) -> (Vec<EvaluatedFrame>, protocol::Ledger) {
     evaluate_with(folder, stepped, CodecConfig { dtype: Dtype::F16, ..CodecConfig::default() })
 }
@@ -103,7 +103,7 @@ fn over_an_ideal_link_boxes_are_those_of_an_evaluation_without_one() {
     assert_eq!((ledger.total().sent, ledger.total().received), (4 * TICKS as u64, 4 * TICKS as u64));
 }
 
-/// What the ego leaves out for others it has itself, over a link and without one.
+/// Cells that the ego masks out for others are present in its own map, over a link and without one.
 #[test]
 fn a_budget_cuts_the_neighbours_maps_and_not_the_egos_own() {
     let folder = scene();
@@ -112,7 +112,7 @@ fn a_budget_cuts_the_neighbours_maps_and_not_the_egos_own() {
     let (stepped, _) = evaluate_with(folder.path(), Some(config(LinkConfig::default())), codec);
     assert_eq!(offline.len(), TICKS);
     for (offline, stepped) in offline.iter().zip(&stepped) {
-        // A whole map has 65 kB.
+        // A complete feature map has 65 kB.
         assert!(offline.result.fused.iter().all(|neighbour| neighbour.payload_bytes < 20_000));
         assert!(!offline.result.detections.is_empty());
         assert_eq!(offline.result.detections, stepped.result.detections);
@@ -132,14 +132,14 @@ fn the_ego_fuses_exactly_what_has_come_by_its_deadline() {
         for (tick, frame) in frames.iter().enumerate() {
             let expected = if tick < first_tick { vec![] } else { vec![age_ms; 2] };
             assert_eq!(ages_ms(frame), expected, "delay {delay_ms} ms, tick {tick}");
-            // What is complete is not waited for.
+            // A complete frame is not delayed.
             let took_ms = (frame.stamp.publish_nanos - frame.stamp.capture_nanos) / MS;
             let expected = if age_ms == 0 { compute_ms as u64 + 5 } else { 105 };
             assert_eq!(took_ms, expected, "delay {delay_ms} ms, tick {tick}");
         }
         assert!(ledger.balance().is_exact(), "{:?}", ledger.balance());
     }
-    // Older than may be fused.
+    // Older than the age limit of the fusion.
     let link = LinkConfig { delay: DelayModel::ConstantMs(450.0), ..LinkConfig::default() };
     let (frames, ledger) = evaluate(folder.path(), Some(config(link)));
     assert!(frames.iter().all(|frame| frame.result.fused.is_empty() && frame.result.skipped.len() == 2));
@@ -157,7 +157,7 @@ fn a_clock_that_is_off_shifts_what_belongs_together() {
     ] {
         let clock = DeviceClock { offset_ms, drift_ppm, step: None };
         let (frames, ledger) = evaluate(folder.path(), Some(config(LinkConfig { clock, ..LinkConfig::default() })));
-        // The scene begins at 0, and no clock shows less.
+        // The scene begins at 0, and no clock is below that.
         for (frame, age_ms) in frames[2..].iter().zip(ages_in_ms) {
             assert_eq!(ages_ms(frame), [age_ms; 2], "{clock:?}");
         }
@@ -166,7 +166,7 @@ fn a_clock_that_is_off_shifts_what_belongs_together() {
 }
 
 #[test]
-fn a_clock_that_is_set_costs_its_vehicle_and_nobody_else() {
+fn a_clock_that_is_set_costs_only_its_vehicle() {
     let folder = scene();
     let run = |by_ms| {
         let clock = DeviceClock { step: Some(ClockStep { at_s: 0.2, by_ms }), ..DeviceClock::default() };
@@ -175,11 +175,11 @@ fn a_clock_that_is_set_costs_its_vehicle_and_nobody_else() {
         (frames.iter().map(ages_ms).collect::<Vec<_>>(), ledger)
     };
     let (ages_ms, ledger) = run(10_000.0);
-    // What it said before serves until it is too old.
+    // Its earlier messages serve until they are too old.
     let expected: Vec<Vec<i64>> = [0, 0, 100, 200, 300].map(|age_ms| vec![age_ms; 2]).into();
     assert_eq!(ages_ms[..5], expected);
     assert!(ages_ms[5..].iter().all(Vec::is_empty), "{ages_ms:?}");
-    // What it says since waits for a time that the scene does not see.
+    // Its later messages wait for a time after the end of the scene.
     assert_eq!(ledger.total().in_flight, 2 * (TICKS as u64 - 2), "{ledger:?}");
     let (ages_ms, _) = run(-30.0);
     assert!(ages_ms[..2].iter().all(|ages| ages == &[0, 0]), "{ages_ms:?}");
@@ -228,10 +228,10 @@ fn run_up(folder: &Path, scenario: &Path, runs: &str) -> RunResult {
 #[test]
 fn a_stepped_run_is_the_same_bytes_every_time() {
     let folder = tempfile::tempdir().unwrap();
-    let air = "capacity: {token_bucket: {rate_mbps: 20}}\ndelay: {normal: {mean_ms: 60, std_ms: 30}}\nloss: {bernoulli: 0.2}\n";
-    fs::write(folder.path().join("air.yaml"), air).unwrap();
+    let link = "capacity: {token_bucket: {rate_mbps: 20}}\ndelay: {normal: {mean_ms: 60, std_ms: 30}}\nloss: {bernoulli: 0.2}\n";
+    fs::write(folder.path().join("link.yaml"), link).unwrap();
     let rest = "clock: stepped\nstepped: {compute: {pose_ms: 10, map_ms: 40, fuse_ms: 20}}\n\
-        link: {model: air.yaml, seed: 5}\nego: {max_age_ms: 500}\nvehicles: {\"4288\": {pose: {noisy: {position_std_m: 0.5}}}}";
+        link: {model: link.yaml, seed: 5}\nego: {max_age_ms: 500}\nvehicles: {\"4288\": {pose: {noisy: {position_std_m: 0.5}}}}";
     let scenario = write_scenario(folder.path(), TICKS, "seek: 1", rest);
     let (one, two) = (run_up(folder.path(), &scenario, "one"), run_up(folder.path(), &scenario, "two"));
     assert_same_bytes(&one, &two);
@@ -250,9 +250,9 @@ fn agents_in_processes_of_their_own_give_the_same_bytes() {
     let folder = tempfile::tempdir().unwrap();
     tests::scene::write(folder.path(), &["4279", "4288", "4297"], TICKS);
     write_sighted_weights(&folder.path().join("weights.safetensors"));
-    let air = "capacity: {token_bucket: {rate_mbps: 20}}\ndelay: {normal: {mean_ms: 60, std_ms: 30}}\nloss: {bernoulli: 0.2}\n";
-    fs::write(folder.path().join("air.yaml"), air).unwrap();
-    // Everything that an agent's process has to be told: noise, codec, limits, one vehicle with settings of its own.
+    let link = "capacity: {token_bucket: {rate_mbps: 20}}\ndelay: {normal: {mean_ms: 60, std_ms: 30}}\nloss: {bernoulli: 0.2}\n";
+    fs::write(folder.path().join("link.yaml"), link).unwrap();
+    // All settings that an agent's process needs: noise, codec, limits, one vehicle with settings of its own.
     for (method, rest) in [
         (
             "max",
@@ -265,7 +265,7 @@ fn agents_in_processes_of_their_own_give_the_same_bytes() {
             let text = format!(
                 "run: test\nscene: {{dir: scene}}\nmodels: {{weights: weights.safetensors}}\nmethod: {method}\nclock: stepped\n\
                  stepped: {{compute: {{pose_ms: 10, map_ms: 40, fuse_ms: 20}}, processes: {processes}}}\n\
-                 link: {{model: air.yaml, seed: 5}}\nego: {{max_age_ms: 500}}\n{rest}\n"
+                 link: {{model: link.yaml, seed: 5}}\nego: {{max_age_ms: 500}}\n{rest}\n"
             );
             let path = folder.path().join("scenario.yaml");
             fs::write(&path, text).unwrap();
@@ -283,7 +283,7 @@ fn agents_in_processes_of_their_own_give_the_same_bytes() {
 fn compute_times_are_measured_once_and_written_down() {
     let folder = tempfile::tempdir().unwrap();
     let scenario = write_scenario(folder.path(), 3, "", "clock: stepped");
-    // On a busy machine the times may be more than a frame lasts: then the run is refused, and says so.
+    // On a busy machine the compute times may exceed a frame: then the run is refused with a message.
     let options = UpOptions { runs: folder.path().join("runs"), programs: programs().to_owned(), prefix: "up" };
     match up(&Scenario::load(&scenario).unwrap(), &options) {
         Ok(run) => {
@@ -302,7 +302,7 @@ fn sweep(folder: &Path, out: &str, jobs: &str, more: &[&str]) -> Output {
     command.args(["--jobs", jobs]).args(more).output().unwrap()
 }
 
-fn said(output: &Output) -> String {
+fn text_of(output: &Output) -> String {
     String::from_utf8_lossy(&output.stderr).into_owned()
 }
 
@@ -316,16 +316,16 @@ fn a_sweep_is_the_same_csv_in_one_process_and_in_many() {
         seed: [1]\n";
     fs::write(folder.path().join("experiment.yaml"), text).unwrap();
     let dry = sweep(folder.path(), "dry", "2", &["--dry-run"]);
-    assert!(dry.status.success() && dry.stdout.is_empty(), "{}", said(&dry));
+    assert!(dry.status.success() && dry.stdout.is_empty(), "{}", text_of(&dry));
     assert!(
-        said(&dry).contains("3 method x 2 codec x 2 latency_ms x 2 bandwidth_mbps = 24 runs of 4 frames"),
+        text_of(&dry).contains("3 method x 2 codec x 2 latency_ms x 2 bandwidth_mbps = 24 runs of 4 frames"),
         "{}",
-        said(&dry)
+        text_of(&dry)
     );
-    assert!(said(&dry).contains("minutes for 24 runs with 2 jobs"), "{}", said(&dry));
+    assert!(text_of(&dry).contains("minutes for 24 runs with 2 jobs"), "{}", text_of(&dry));
 
     let [one, many] = [("one", "1"), ("many", "3")].map(|(out, jobs)| sweep(folder.path(), out, jobs, &[]));
-    assert!(one.status.success() && many.status.success(), "{}\n{}", said(&one), said(&many));
+    assert!(one.status.success() && many.status.success(), "{}\n{}", text_of(&one), text_of(&many));
     let read = |out: &str, name: &str| fs::read_to_string(folder.path().join(out).join(name)).unwrap();
     let csv = read("one", "e.csv");
     assert_eq!(csv, read("many", "e.csv"));
@@ -350,20 +350,20 @@ fn a_sweep_is_the_same_csv_in_one_process_and_in_many() {
     let page = read("one", "report.html");
     assert!(page.contains("A &lt; B") && page.contains("<svg") && !page.contains("src="), "self-contained");
 
-    // What is done is not done again; what the sweep is of decides that.
+    // Completed runs are not repeated; the key is the content of the sweep.
     let again = sweep(folder.path(), "one", "2", &[]);
-    assert!(again.status.success() && said(&again).contains("24 done before"), "{}", said(&again));
+    assert!(again.status.success() && text_of(&again).contains("24 done before"), "{}", text_of(&again));
     assert_eq!(again.stdout, one.stdout);
     fs::write(folder.path().join("experiment.yaml"), text.replace("seed: [1]", "seed: [1, 2]")).unwrap();
     let more = sweep(folder.path(), "one", "2", &["--dry-run"]);
-    assert!(said(&more).contains("48 runs of 4 frames, 24 done before"), "{}", said(&more));
+    assert!(text_of(&more).contains("48 runs of 4 frames, 24 done before"), "{}", text_of(&more));
 }
 
 #[test]
 fn an_experiment_that_makes_no_sense_is_refused_by_its_field() {
     let folder = scene();
     let rest = "dataset: scene\nweights: weights.safetensors\n";
-    for (text, words) in [
+    for (text, message) in [
         ("grid: {method: [max], agents: [4]}", "grid.agents is 4, but scenario scene has 3 vehicles"),
         ("link: dsrc\ngrid: {method: [max], loss: [0.1]}", "grid.loss and the loss of link dsrc contradict"),
         ("grid: {method: [max], latencies: [1]}", "latencies"),
@@ -374,7 +374,7 @@ fn an_experiment_that_makes_no_sense_is_refused_by_its_field() {
     ] {
         fs::write(folder.path().join("experiment.yaml"), format!("name: e\n{rest}{text}\n")).unwrap();
         let output = sweep(folder.path(), "out", "1", &[]);
-        assert!(output.status.code() == Some(2) && said(&output).contains(words), "{text}: {}", said(&output));
+        assert!(output.status.code() == Some(2) && text_of(&output).contains(message), "{text}: {}", text_of(&output));
     }
 }
 
@@ -389,7 +389,7 @@ fn an_evaluation_crosses_a_link() {
         .arg(folder.path().join("weights.safetensors"))
         .output()
         .unwrap();
-    assert!(output.status.success(), "{}", said(&output));
+    assert!(output.status.success(), "{}", text_of(&output));
     let metrics: Value = serde_json::from_slice(&output.stdout).unwrap();
     assert_eq!((&metrics["clock"], &metrics["age_ms"]["p50"]), (&"stepped".into(), &100.0.into()));
 }

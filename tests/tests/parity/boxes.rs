@@ -67,7 +67,7 @@ fn golden_c3_boxes_iou_nms() {
     check_corners_to_box(&golden, &boxes);
 }
 
-/// The picks at every stored threshold; their names hold two digits of it.
+/// The picks at every stored threshold; their names have two digits of it.
 fn check_picks(golden: &Golden, polygons: &[Polygon]) {
     let (_, scores) = golden.f32("in.scores");
     let thresholds = golden.config()["thresholds"].as_array().expect("thresholds").clone();
@@ -80,7 +80,7 @@ fn check_picks(golden: &Golden, polygons: &[Polygon]) {
     }
 }
 
-/// Corners to box, apart from the yaw of boxes that point backwards, where the reference's mean of angles breaks.
+/// Corners to box, except for the yaw of boxes that point backwards, for which the reference's mean of angles fails.
 fn check_corners_to_box(golden: &Golden, boxes: &[Box3d]) {
     let (_, stored_corners) = golden.f32("out.corners");
     let (_, expected) = golden.f32("out.corner_to_center_hwl");
@@ -99,7 +99,7 @@ fn check_corners_to_box(golden: &Golden, boxes: &[Box3d]) {
     }
 }
 
-/// What the chain of a case needs.
+/// Inputs of the chain of a case.
 struct PostprocessCase {
     anchors: Anchors,
     config: PostprocessConfig,
@@ -164,7 +164,7 @@ impl PostprocessCase {
         (boxes, output_from_agent)
     }
 
-    /// Everything in the output frame, and what the size and height filter leaves of it.
+    /// All candidates in the output frame, and those that the size and height filter keeps.
     fn check_filter(&self, golden: &Golden, agents: &[AgentBoxes<'_>]) -> Vec<Candidate> {
         let mut candidates: Vec<Candidate> = Vec::new();
         for (agent, boxes) in agents.iter().enumerate() {

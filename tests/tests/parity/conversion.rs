@@ -1,4 +1,4 @@
-//! Checkpoints of the public code bases through the converter, on python3 alone.
+//! Checkpoints of the public code bases through the converter, with python3 only.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -29,7 +29,7 @@ use tests::tensors::{integer, number, pillars, tensor, values};
 const ATOL: f64 = 2e-4;
 const RTOL: f64 = 1e-4;
 
-/// RunScope the converter: the converted file and its standard output, or its standard error.
+/// Runs the converter: the converted file and its standard output, or its standard error.
 fn convert(state: &Path, arguments: &[&str]) -> Result<(PathBuf, String), String> {
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy/tools/convert_opencood.py");
     let out = state.with_extension("converted.safetensors");
@@ -81,10 +81,10 @@ fn golden_converted_where2comm_of_one_scale_runs_live() {
     tch::set_num_threads(1);
     let folder = tempfile::tempdir().unwrap();
     let (golden, state) = copied("c6_e2e_where2comm_single", folder.path());
-    let (path, said) = convert(&state, &["--model", "point_pillar_where2comm"]).unwrap();
+    let (path, output) = convert(&state, &["--model", "point_pillar_where2comm"]).unwrap();
     let communication = &golden.config()["where2comm_fusion"]["communication"];
     let threshold = number(&communication["threshold"]);
-    assert!(said.contains(&format!("--gate {threshold}")), "{said}");
+    assert!(output.contains(&format!("--gate {threshold}")), "{output}");
     let weights = Weights::load(&path).unwrap();
     let config: DetectorConfig = weights.config().unwrap();
     assert_eq!((config.y_axis, config.blocks), (YAxis::Right, BlockKind::Plain));
@@ -98,7 +98,7 @@ fn golden_converted_where2comm_of_one_scale_runs_live() {
     assert_eq!(Ego::load(&path, None).unwrap().method(), Method::WHERE2COMM);
 }
 
-/// Two vehicles that see something of the same street.
+/// Two vehicles with overlapping views of the same street.
 fn frames(mirrored: bool) -> [Frame; 2] {
     [0, 1].map(|place| {
         let mut frame = Frame::empty(CavId::new(&format!("{place}")).unwrap(), 0, Handedness::Right);
@@ -129,19 +129,19 @@ fn golden_converted_networks_detect_offline_in_either_world() {
             let mut detector = OfflineDetector::load(&converted).unwrap();
             let frames = frames(mirrored);
             let (together, bytes) = detector.detect(&frames).unwrap();
-            // 16 channels on 16 x 32 cells in `f32`; where cells are left out, a bit for each beside those that are not.
+            // 16 channels on 16 x 32 cells in `f32`; if cells are left out, a bit for each.
             let whole = 4 * 16 * 16 * 32;
             let fewest = if model == "point_pillar_where2comm" { 64 } else { whole };
             assert!(
                 bytes.len() == 1 && (fewest..=whole).contains(&bytes[0]) && bytes[0] % 64 == 0,
                 "{name}: {bytes:?}"
             );
-            let (alone, bytes) = detector.detect(&frames[..1]).unwrap();
+            let (ego_only, bytes) = detector.detect(&frames[..1]).unwrap();
             assert!(bytes.is_empty(), "{name}");
-            assert!(!together.is_empty() && together != alone, "{name}: {} boxes", together.len());
+            assert!(!together.is_empty() && together != ego_only, "{name}: {} boxes", together.len());
             found.push(together);
         }
-        // What a network of the mirrored world sees of the mirrored street is the mirror image.
+        // The output of a network of the mirrored frame for the mirrored street is the mirror image.
         assert_eq!(found[0].len(), found[1].len(), "{name}");
         for (here, there) in found[0].iter().zip(&found[1]) {
             let there = there.box3d.mirrored_y();
@@ -151,7 +151,7 @@ fn golden_converted_networks_detect_offline_in_either_world() {
     }
 }
 
-/// A state dictionary with the names of the reference around a fusion of ours, as nobody has published small ones.
+/// A state dictionary with the names of the reference around a fusion of this project, as no small ones are published.
 fn state_of(folder: &Path, method: Method, fusion: &FusionConfig) -> (PathBuf, BTreeMap<String, Tensor>) {
     let detector = DetectorConfig {
         lidar_range_m: [-12.8, -6.4, -3.0, 12.8, 6.4, 1.0],
@@ -242,8 +242,8 @@ fn fusions_with_parameters_come_back_with_every_one() {
         let config = folder.path().join("config.json");
         std::fs::write(&config, hypes.to_string()).unwrap();
         let arguments = ["--config", config.to_str().unwrap(), "--y-axis", "left"];
-        let (path, said) = convert(&state, &arguments).unwrap();
-        assert!(said.contains("4 of 16 channels"), "{said}");
+        let (path, output) = convert(&state, &arguments).unwrap();
+        assert!(output.contains("4 of 16 channels"), "{output}");
         let weights = Weights::load(&path).unwrap();
         assert_eq!(weights.metadata_json::<FusionConfig>("fusion").unwrap(), fusion, "{method}");
         let detector: DetectorConfig = weights.config().unwrap();

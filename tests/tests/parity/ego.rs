@@ -142,7 +142,7 @@ fn golden_c5_warp_coalign() {
     }
 }
 
-/// Our own warp, exact in metres, against CoAlign's on a lattice around the vehicle, where both mean the same.
+/// The project's own warp, exact in metres, against CoAlign's on a BEV grid around the vehicle, where both are equal.
 #[test]
 fn golden_c5_warp_in_metres_agrees_with_coalign() {
     let golden = golden("c5_warp_coalign");
@@ -161,12 +161,12 @@ fn golden_c5_warp_in_metres_agrees_with_coalign() {
     let expected = tensor(&golden, "out.warp_affine_simple");
     for sample in 0..features.size()[0] {
         for ego in 0..features.size()[1] {
-            // P[ego, cav] takes points of the ego to the frame of the CAV; only its planar part enters a warp.
+            // P[ego, cav] transforms points of the ego to the frame of the CAV; only its planar part enters a warp.
             let poses: Vec<Pose> =
                 (0..features.size()[1]).map(|cav| planar_inverse(&pairwise.get(sample).get(ego).get(cav))).collect();
             let warped = warp_to_ego(&features.get(sample), None, &poses, &grid).unwrap();
             let expected = expected.get(sample).get(ego) * &warped.mask;
-            // The reference scales sheared planar parts of tilted poses; ours keeps them rigid.
+            // The reference scales sheared planar parts of tilted poses; this project's warp keeps them rigid.
             let difference = (&warped.features - expected).abs().mean(Kind::Float).double_value(&[]);
             assert!(difference < 2e-2, "sample {sample}, ego {ego}: {difference}");
         }
@@ -180,7 +180,7 @@ fn golden_c5_pairwise_coalign() {
     let mut cases = 0;
     for name in golden.names() {
         let Some(case) = name.strip_prefix("out.normalized_") else { continue };
-        // The name says it all: <rows>x<columns>_r<voxel size>_d<down-sampling>.
+        // The name has the parameters: <rows>x<columns>_r<voxel size>_d<down-sampling>.
         let mut parts = case.split('_');
         let (rows, columns) = parts.next().unwrap().split_once('x').unwrap();
         let ratio: f64 = parts.next().unwrap().strip_prefix('r').unwrap().parse().unwrap();
@@ -211,7 +211,7 @@ fn golden_c6_coalign_att_max() {
     let features = tensor(&golden, "in.x");
     let normalized = tensor(&golden, "in.normalized");
     let (_, agents) = golden.i64("in.record_len");
-    // The reference's two doors, raw pairwise transforms and normalised ones, lead to the same result.
+    // The reference's two inputs, raw pairwise transforms and normalised ones, lead to the same result.
     let full_size = golden.config()["full_size"][0].as_f64().unwrap();
     let [.., height, width] = features.size()[..] else { panic!("features have four dimensions") };
     let pixel_m = number(&golden, "discrete_ratio") * full_size / height as f64;

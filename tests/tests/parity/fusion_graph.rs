@@ -35,7 +35,7 @@ fn golden_c6_v2vnet() {
             Incoming {
                 theta: opencood::normalized(&centred, height, width).unwrap(),
                 corners_aligned: true,
-                // The reference turns its mask about another point than its maps.
+                // The reference rotates its mask about another point than its maps.
                 mask: opencood::rotated_extent(&to_receiver, height, width).unwrap(),
             }
         });
@@ -186,7 +186,7 @@ fn golden_c6_where2comm_orig_single() {
         .zip(features.split_with_sizes(&agents, 0))
         .zip(&samples)
         .map(|((sample, maps), placement)| {
-            // The reference masks all maps of sample b by the mask of the b-th map in the batch: a slip of its index.
+            // The reference masks all maps of sample b by the mask of the b-th map in the batch: an index error.
             let maps = maps * sent.get(sample);
             fuse(&fusion, &coalign::warp_affine(&maps, placement.theta.as_ref().unwrap()).unwrap())
         })
@@ -233,7 +233,7 @@ fn golden_c6_e2e_where2comm_multi() {
     assert_eq!(rate as f32, golden.f32("out.com").1[0], "rate");
 }
 
-/// At a single scale the published network is our live one: agents encode and select, the ego fuses and detects.
+/// At a single scale the published network equals the live one: agents encode and select, the ego fuses and detects.
 #[test]
 fn golden_c6_e2e_where2comm_single() {
     let golden = golden("c6_e2e_where2comm_single");
@@ -259,7 +259,7 @@ fn golden_c6_e2e_where2comm_single() {
         let mut sent_share = Vec::new();
         for agent in first..first + count {
             let (map, share) = through_the_codec(&maps.get(agent), &confidence.get(agent), &gate);
-            // What the ego has it need not send.
+            // The ego's own map is not sent.
             received.push(if agent == first { maps.get(agent) } else { map });
             sent_share.push(share);
         }
@@ -274,7 +274,7 @@ fn golden_c6_e2e_where2comm_single() {
     assert_eq!(rate as f32, golden.f32("out.com").1[0], "rate");
 }
 
-/// What arrives of a map `[C, H, W]`, and the share of its cells.
+/// A map `[C, H, W]` after the codec, and the share of its cells.
 fn through_the_codec(map: &Tensor, confidence: &Tensor, gate: &ConfidenceGate) -> (Tensor, f64) {
     let (channels, height, width) = map.size3().unwrap();
     let grid = BevGrid { x_min_m: 0.0, y_min_m: 0.0, cell_m: 0.4, width: width as u32, height: height as u32 };
@@ -309,7 +309,7 @@ fn check_heads(golden: &Golden, network: &MultiScaleNetwork, samples: &[Placemen
     output.rate
 }
 
-/// Fuses aligned maps that reach everywhere.
+/// Fuses aligned maps that cover the whole grid.
 fn fuse(fusion: &dyn Fusion, maps: &Tensor) -> Tensor {
     let (agents, _, height, width) = maps.size4().unwrap();
     let mask = Tensor::ones([agents, 1, height, width], (Kind::Float, Device::Cpu));
@@ -319,7 +319,7 @@ fn fuse(fusion: &dyn Fusion, maps: &Tensor) -> Tensor {
     no_grad(|| fusion.fuse(&maps)).unwrap().map
 }
 
-/// Where maps lie by the pairwise transforms of a case, `[height, width]` being the size of the map they are made for.
+/// Poses of maps from the pairwise transforms of a case, `[height, width]` being the size of the map they are made for.
 fn placements(golden: &Golden, agents: &[i64], [height, width]: [i64; 2], downsampled: &Value) -> Vec<Placement> {
     let pixel_m = number(&golden.config()["voxel_size"][0]) * number(downsampled);
     let normalized = coalign::normalized(&tensor(golden, "in.pairwise"), height, width, pixel_m).unwrap();
@@ -370,7 +370,7 @@ fn communication(config: &Value, threshold: &str) -> CommunicationConfig {
     CommunicationConfig { threshold: number(&config[threshold]), smoothing: gate(config, threshold).smoothing }
 }
 
-/// What the agents of a case would send, `[N, 1, H, W]`; the window is among its weights below `prefix`.
+/// Masks of the agents of a case, `[N, 1, H, W]`; the window is among its weights below `prefix`.
 fn masks(golden: &Golden, prefix: &str, config: &Value, threshold: &str, logits: &Tensor) -> Tensor {
     let variables = VarStore::new(Device::Cpu);
     let communication = Communication::new(&variables.root(), &communication(config, threshold)).unwrap();
@@ -399,11 +399,11 @@ fn assert_rate(golden: &Golden, name: &str, agents: &[i64], rate: impl Fn(std::o
         rate(first - count..first)
     });
     let found = rates.sum::<f64>() / agents.len() as f64;
-    // The reference adds up shares in single precision.
+    // The reference sums up shares in single precision.
     assert!((found - f64::from(golden.f32(name).1[0])).abs() < 1e-6, "{name}: {found}");
 }
 
-/// The selection of the codec, in plain numbers with a window of its own, is that of the network on tensors.
+/// The selection of the codec, in plain numbers with a window of its own, equals that of the network on tensors.
 fn assert_codec_agrees(config: &Value, threshold: &str, logits: &Tensor, masks: &Tensor) {
     let gate = gate(config, threshold);
     let confidence = logits.sigmoid().amax([1], false);

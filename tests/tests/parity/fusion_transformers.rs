@@ -13,7 +13,7 @@ use tests::tensors::{integer, integers, number, tensor, values};
 /// Tolerance of the V2X-ViT fixtures.
 const ATOL: f64 = 2e-4;
 const RTOL: f64 = 1e-4;
-/// State of the references that no result depends on.
+/// State of the references on which no result depends.
 const UNUSED: [&str; 2] = ["prior_feed.", "relative_position_index"];
 
 #[test]
@@ -49,7 +49,7 @@ fn check_v2xvit(name: &str) {
 
     let mut stages: [Vec<Tensor>; 3] = Default::default();
     for sample in 0..samples {
-        // Slots without an agent are not computed; nothing that the ego sees depends on them.
+        // Slots without an agent are not computed; no output of the ego depends on them.
         let agents = present.get(sample).sum(Kind::Int64).int64_value(&[]);
         let maps = moved.get(sample).narrow(0, 0, agents).permute([0, 3, 1, 2]);
         let types: Vec<usize> = (0..agents).map(|agent| prior.double_value(&[sample, agent, 2]) as usize).collect();
@@ -121,7 +121,7 @@ fn golden_c6_hmsa_mswin() {
         let types: Vec<usize> = (0..slots).map(|slot| prior.double_value(&[sample, slot, 0, 0, 2]) as usize).collect();
         let all = agents.forward(&tokens, Some(&unseen), &types, types.len(), false).unwrap();
         let ego = agents.forward(&tokens, Some(&unseen), &types, 1, false).unwrap();
-        assert_close("the ego alone", &values(&ego.get(0)), &values(&all.get(0)), 1e-5, 0.0);
+        assert_close("ego-only", &values(&ego.get(0)), &values(&all.get(0)), 1e-5, 0.0);
         let each = |step: &dyn Fn(&Tensor) -> Tensor| {
             Tensor::stack(&(0..slots).map(|slot| step(&tokens.get(slot))).collect::<Vec<_>>(), 0)
         };
@@ -171,7 +171,7 @@ fn check_swap_fusion(name: &str) {
     for (sample, agents) in integers(&config["agents"]).into_iter().enumerate() {
         let maps = x.get(sample as i64);
         let reach = mask.get(sample as i64).squeeze_dim(2).permute([2, 0, 1]);
-        // Without the mask, slots without an agent are agents that see nothing.
+        // Without the mask, slots without an agent are agents with empty maps.
         let slots = Slots {
             asked: if masked { agents } else { cobevt.slots },
             reach: masked.then_some(&reach),

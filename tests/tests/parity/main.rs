@@ -1,4 +1,4 @@
-//! Parity with the reference implementations: layers, boxes, poses, losses and converted checkpoints against `tests/golden`.
+//! Parity with the reference implementations: layers, boxes, poses, losses and converted checkpoints.
 
 mod boxes;
 mod conversion;

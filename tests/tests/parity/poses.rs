@@ -14,7 +14,7 @@ use tests::fixtures::{Golden, assert_close, golden};
 
 /// Tolerance of matrices that the reference computed in doubles.
 const F64_ATOL: f64 = 1e-10;
-/// Tolerance of what it computed in floats.
+/// Tolerance of values that it computed in floats.
 const F32_ATOL: f64 = 1e-4;
 
 /// `N` numbers per row.
@@ -28,7 +28,7 @@ fn poses(golden: &Golden, name: &str) -> Vec<Pose> {
     rows::<6>(golden, name).into_iter().map(|six| CarlaPose::from(six).to_pose()).collect()
 }
 
-/// A transform of ours as the row-major left-handed matrix of the archives.
+/// A transform as the row-major left-handed matrix of the archives.
 fn left_handed(pose: &Pose) -> Vec<f64> {
     let mirror = Matrix4::from_diagonal(&[1.0, -1.0, 1.0, 1.0].into());
     let matrix = mirror * pose.isometry().to_homogeneous() * mirror;
@@ -122,7 +122,7 @@ fn golden_projected_and_cropped_points() {
     assert_close("without own body", &without_body, &golden.f32("out.points_ego_masked").1, 0.0, 0.0);
 
     let bounds: [f64; 6] = numbers_after(note, "range mask [").try_into().unwrap();
-    // y is mirrored, and with it which of its bounds is the lower one.
+    // y is mirrored, and with it the lower and upper bounds.
     let lidar_range_m = [bounds[0], -bounds[4], bounds[2], bounds[3], -bounds[1], bounds[5]];
     let in_range = kept_by(DetectorConfig { lidar_range_m, own_body_m: None, ..DetectorConfig::full() });
     assert_close("in range", &in_range, &golden.f32("out.points_range_masked").1, 0.0, 0.0);
@@ -230,7 +230,7 @@ fn golden_world_objects() {
         let [l, w, h] = box3d.size_m;
         assert_close(&format!("object {id}"), &[x, y, z, h, w, l], &expected[..6], F32_ATOL, 0.0);
         let yaw = -box3d.heading_rad;
-        // Within 1e-6 of half a turn the reference's average of four angles may come out as 0.
+        // Within 1e-6 of half a turn the reference's average of four angles may result in 0.
         let reference_is_torn = std::f64::consts::PI - yaw.abs() < 1e-6;
         assert!(reference_is_torn || (yaw - expected[6]).abs() <= 1e-5, "object {id}: {yaw} is not {}", expected[6]);
     }

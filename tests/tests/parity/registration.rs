@@ -9,14 +9,14 @@ use protocol::Pose;
 use serde_json::Value;
 use tests::fixtures::{Golden, assert_close, golden};
 
-/// Threshold of the reference's refinement of SC2-PCR, metres; the archive holds it in the text that comes with it only.
+/// Threshold of the reference's refinement of SC2-PCR, metres; the archive has it only in its accompanying text.
 const REFINEMENT_M: f64 = 0.6;
 
-/// How far an estimate may be from the truth, metres and degrees.
+/// Largest error of an estimate, metres and degrees.
 const TRUTH_TOLERANCE: (f64, f64) = (0.15, 0.5);
-/// How far estimates are apart when equal scores are sorted differently, metres and degrees. The scores of the second
-/// order are small integers, and the reference sorts them with an unstable sort: with all confidences of the case
-/// `clean` equal to the last bit, its seeds are 75, 89, 88, 87 and so on.
+/// Difference of estimates when equal scores are sorted differently, metres and degrees. The scores of the second order
+/// are small integers, and the reference sorts them with an unstable sort: with all confidences of the case `clean`
+/// equal to the last bit, its seeds are 75, 89, 88, 87 and so on.
 const TIE_TOLERANCE: (f64, f64) = (0.07, 0.3);
 
 #[test]
@@ -81,13 +81,13 @@ fn golden_c8_sc2pcr() {
         let (_, expected) = golden.f32(&format!("{name}.out.transform_refined"));
         let refined = sc2pcr::refine(&pairs, &reference, &refinement);
         assert_close(&format!("{name}: refined"), &rows(&refined), &expected, 1e-4, 0.0);
-        // From our own start the weights differ a little, and with them the result.
+        // From the project's own start the weights differ a little, and with them the result.
         let refined = sc2pcr::refine(&pairs, &found.target_from_source, &refinement);
         assert_close(&format!("{name}: refined from our start"), &rows(&refined), &expected, 2e-3, 0.0);
     }
 }
 
-/// Our own search solves the same problems, to the tolerance that the reference's solutions keep with the truth.
+/// The project's own search solves the same problems, to the tolerance of the reference's solutions against the truth.
 #[test]
 fn ransac_solves_the_golden_problems() {
     let golden = golden("c8_sc2pcr");
@@ -111,7 +111,7 @@ fn motion(rows: &[f64]) -> Isometry3<f64> {
     Pose::from_matrix(&Matrix4::from_row_slice(rows)).expect("a motion").isometry()
 }
 
-/// Seeds must be the same, or have the same confidence: their order is that of numbers that rounding makes equal or not.
+/// Seeds must be the same, or have the same confidence: rounding decides the order of nearly equal values.
 fn check_seeds(name: &str, seeds: &[usize], expected: &[i64], confidence: &[f32]) {
     assert_eq!(seeds.len(), expected.len(), "{name}: seeds");
     for (place, (&seed, &reference)) in seeds.iter().zip(expected).enumerate() {

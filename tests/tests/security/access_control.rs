@@ -1,4 +1,4 @@
-//! Key, header and certificate: who may say what, through real sessions over QUIC.
+//! Access control by key, header and certificate: permitted and refused operations, through real sessions over QUIC.
 
 use std::collections::BTreeSet;
 use std::sync::{Arc, Mutex};
@@ -21,7 +21,7 @@ fn estimate() -> PoseEstimate {
     PoseEstimate::new(Pose::IDENTITY, 1.0)
 }
 
-/// A sound message of vehicle `cav`, as its own agent would send it.
+/// A valid message of vehicle `cav`, as its own agent would send it.
 fn forged_pose(cav: &str) -> Vec<u8> {
     let stamp =
         Stamp { cav: cav.parse().unwrap(), epoch: 1, sequence: 0, capture_nanos: 1, publish_nanos: unix_nanos() };
@@ -29,17 +29,17 @@ fn forged_pose(cav: &str) -> Vec<u8> {
     [encoded.head.to_vec(), encoded.body.as_bytes().to_vec()].concat()
 }
 
-/// Everything that comes through a router, as its own session sees it.
-fn overheard(router: &Session) -> (Arc<Mutex<BTreeSet<String>>>, zenoh::pubsub::Subscriber<()>) {
+/// Keys of all messages that pass a router, as its own session receives them.
+fn captured_keys(router: &Session) -> (Arc<Mutex<BTreeSet<String>>>, zenoh::pubsub::Subscriber<()>) {
     let keys = Arc::<Mutex<BTreeSet<String>>>::default();
-    let heard = Arc::clone(&keys);
+    let captured = Arc::clone(&keys);
     let subscriber = router.declare_subscriber("v2v/**").callback(move |sample| {
-        heard.lock().unwrap().insert(sample.key_expr().to_string());
+        captured.lock().unwrap().insert(sample.key_expr().to_string());
     });
     (keys, subscriber.wait().unwrap())
 }
 
-/// Sends poses until one has come: the route stands.
+/// Sends poses until one has arrived: the route is up.
 fn reaches(sender: &Bus, topic_text: &str, receiver: &Arc<Inbox>) {
     let publisher = sender.publisher(topic(topic_text), PublisherOptions::POSE).unwrap();
     let deadline = Instant::now() + PATIENCE;
@@ -57,18 +57,19 @@ fn reaches(sender: &Bus, topic_text: &str, receiver: &Arc<Inbox>) {
 }
 
 #[test]
-fn a_fleet_with_keys_says_what_it_has_to() {
+fn a_fleet_with_keys_performs_all_its_operations() {
     let folder = tempfile::tempdir().unwrap();
     let keys = keys_for(folder.path(), &["agent-1", "ego-1", "link-1", "replay", "scorer", "recorder", "viewer"]);
     let router = GuardedRouter::open(&keys);
     let [agent, ego, link, replay, scorer, recorder, viewer] =
-        ["agent-1", "ego-1", "link-1", "replay", "scorer", "recorder", "viewer"].map(|party| router.join(party));
+        ["agent-1", "ego-1", "link-1", "replay", "scorer", "recorder", "viewer"]
+            .map(|principal| router.join(principal));
     let subscribe = |bus: &Bus, text: &str| {
         let inbox = bus.inbox(64, 4);
         let subscription = bus.subscribe(topic(text), &inbox).unwrap();
         (inbox, subscription)
     };
-    // Each hears what is its to hear.
+    // Each process receives its topics.
     for (sender, text, receivers) in
         [(&agent, "1/pose", [&ego, &link, &scorer, &viewer].as_slice()), (&link, "rx/1/2/pose", &[&ego, &viewer])]
     {
@@ -90,43 +91,43 @@ fn a_fleet_with_keys_says_what_it_has_to() {
     };
     publisher.offer(3, measured);
     let (_, Event::Message(_)) = next_event(&inbox) else { panic!("an end before the message") };
-    // The barrier knows nothing of those who only listen: their route may come up later.
-    let is_gnss = |taken| matches!(taken, bus::bounded_queue::Pop::Item(heard, _) if heard == topic("1/gnss"));
+    // The flush barrier does not cover passive subscribers: their route may come up later.
+    let is_gnss = |taken| matches!(taken, bus::bounded_queue::Pop::Item(found, _) if found == topic("1/gnss"));
     wait_for("the recorder", || {
         publisher.offer(3, measured);
         is_gnss(tap.take(Some(Instant::now())))
     });
     publisher.finish();
 
-    // The replay sees that somebody looks.
-    let looking = viewer.tap(&[protocol::KeyExpr::stream(&viewer.identity().run, Stream::Preview)], 4).unwrap();
+    // The replay detects the subscriber to previews.
+    let viewing = viewer.tap(&[protocol::KeyExpr::stream(&viewer.identity().run, Stream::Preview)], 4).unwrap();
     let preview = replay.publisher(topic("1/@preview"), PublisherOptions::PREVIEW).unwrap();
     wait_for("an onlooker", || preview.is_wanted());
     wait_for("a preview", || {
         preview.offer(3, Lidar::default());
-        matches!(looking.take(Some(Instant::now())), bus::bounded_queue::Pop::Item(..))
+        matches!(viewing.take(Some(Instant::now())), bus::bounded_queue::Pop::Item(..))
     });
     preview.finish();
-    drop(looking);
+    drop(viewing);
 
-    // Who is there is seen by those who follow it.
+    // Membership is visible to its subscribers.
     let seen = Arc::<Mutex<Vec<String>>>::default();
     let _watch = ego.watch(protocol::Role::Agent, {
         let seen = Arc::clone(&seen);
-        move |sighting| seen.lock().unwrap().push(format!("{sighting:?}"))
+        move |event| seen.lock().unwrap().push(format!("{event:?}"))
     });
     let presence = agent.announce(protocol::Role::Agent).unwrap();
-    wait_for("a sighting", || seen.lock().unwrap().iter().any(|text| text.starts_with("Appeared")));
+    wait_for("a liveliness event", || seen.lock().unwrap().iter().any(|text| text.starts_with("Appeared")));
     presence.withdraw().unwrap();
     wait_for("a farewell", || seen.lock().unwrap().iter().any(|text| text.starts_with("Vanished")));
 
-    // And nobody said anything that was not.
-    for party in ["agent-1", "ego-1", "link-1", "replay", "scorer", "recorder", "viewer"] {
-        let refused = ["put", "query", "declare", "interest"].map(|message| router.refused(party, message));
-        assert_eq!(refused, [0; 4], "{party}");
+    // And no process published anything that was refused.
+    for principal in ["agent-1", "ego-1", "link-1", "replay", "scorer", "recorder", "viewer"] {
+        let refused = ["put", "query", "declare", "interest"].map(|message| router.refused(principal, message));
+        assert_eq!(refused, [0; 4], "{principal}");
     }
     for bus in [agent, ego, link, replay, scorer, recorder, viewer] {
-        // Bounded: a question that the router does not answer would take all of it.
+        // Bounded: a query that the router does not answer would take all of it.
         let began = Instant::now();
         bus.leave(PATIENCE).unwrap();
         assert!(began.elapsed() < PATIENCE / 2);
@@ -134,23 +135,23 @@ fn a_fleet_with_keys_says_what_it_has_to() {
 }
 
 #[test]
-fn a_certificate_speaks_for_its_own_vehicle_alone() {
+fn a_certificate_is_valid_for_its_own_vehicle_only() {
     let folder = tempfile::tempdir().unwrap();
     let keys = keys_for(folder.path(), &["agent-1", "agent-2", "ego-1", "viewer"]);
     let router = GuardedRouter::open(&keys);
-    let (heard, _everything) = overheard(&router.session);
+    let (captured, _everything) = captured_keys(&router.session);
     let (honest, ego) = (router.join("agent-2"), router.join("ego-1"));
     let inbox = ego.inbox(64, 4);
     let _subscription = ego.subscribe(topic("2/pose"), &inbox).unwrap();
 
-    // It has a certificate of the fleet, and says that it is vehicle 2.
-    let liar = router.join_as("agent-1", "agent-2", "2").unwrap();
-    let session = liar.session();
+    // It has a certificate of the fleet, and claims to be vehicle 2.
+    let attacker = router.join_as("agent-1", "agent-2", "2").unwrap();
+    let session = attacker.session();
     let forged = [
         "2/pose",       // another's id
-        "*/pose",       // everybody's
+        "*/pose",       // of every vehicle
         "**",           // everything
-        "1/detections", // of its own vehicle, and not its to say
+        "1/detections", // of its own vehicle, but not a topic of its role
         "1/lidar",
         "rx/1/2/pose", // behind another's link
         "truth",
@@ -171,30 +172,30 @@ fn a_certificate_speaks_for_its_own_vehicle_alone() {
     wait_for("a delete", || router.refused("agent-1", "delete") > 0);
     // Another run is another fleet.
     session.put("v2v/other/1/pose", forged_pose("1")).wait().unwrap();
-    // Who answers what nobody may be asked, who listens to the truth, who says that another is there.
-    let _queryable = session.declare_queryable("v2v/test/nobody").callback(|_| panic!("asked")).wait().unwrap();
-    let _truth = session.declare_subscriber("v2v/test/truth").callback(|_| panic!("told")).wait().unwrap();
+    // A queryable where no query is allowed, a subscriber to the truth, a liveliness token of another process.
+    let _queryable = session.declare_queryable("v2v/test/nobody").callback(|_| panic!("queried")).wait().unwrap();
+    let _truth = session.declare_subscriber("v2v/test/truth").callback(|_| panic!("received")).wait().unwrap();
     let _presence = session.liveliness().declare_token("v2v/test/alive/agent/2").wait().unwrap();
     wait_for("declarations", || router.refused("agent-1", "declare") >= 3);
     let tokens = router.session.liveliness().get("v2v/test/alive/**").wait().unwrap();
-    assert!(tokens.recv().is_err(), "nobody has said that it is there");
+    assert!(tokens.recv().is_err(), "no process has declared itself");
     let answers = session.get(format!("@/{}/**", router.session.zid())).timeout(TRIED_FOR).wait().unwrap();
-    let told: Vec<_> = answers.iter().filter_map(|answer| answer.into_result().ok()).collect();
-    assert!(told.is_empty(), "the router tells its configuration to nobody: {told:?}");
+    let answered: Vec<_> = answers.iter().filter_map(|answer| answer.into_result().ok()).collect();
+    assert!(answered.is_empty(), "the router discloses its configuration: {answered:?}");
 
     reaches(&honest, "2/pose", &inbox);
-    reaches(&liar, "1/pose", &{
+    reaches(&attacker, "1/pose", &{
         let inbox = ego.inbox(64, 4);
         std::mem::forget(ego.subscribe(topic("1/pose"), &inbox).unwrap());
         inbox
     });
-    let heard = heard.lock().unwrap().clone();
+    let captured = captured.lock().unwrap().clone();
     let own = |key: &String| {
         ["v2v/test/1/", "v2v/test/2/", "v2v/test/stats/", "v2v/test/ready/"].iter().any(|own| key.starts_with(own))
     };
-    assert!(heard.iter().all(own), "{heard:?}");
-    assert!(!heard.contains("v2v/test/1/detections") && !heard.contains("v2v/test/1/lidar"), "{heard:?}");
-    assert!(!heard.contains("v2v/test/stats/agent-1"), "it said it was agent-2: {heard:?}");
+    assert!(captured.iter().all(own), "{captured:?}");
+    assert!(!captured.contains("v2v/test/1/detections") && !captured.contains("v2v/test/1/lidar"), "{captured:?}");
+    assert!(!captured.contains("v2v/test/stats/agent-1"), "it claimed to be agent-2: {captured:?}");
     assert_eq!(router.refused("agent-2", "put") + router.refused("ego-1", "put"), 0);
 }
 
@@ -215,11 +216,11 @@ fn a_header_under_another_name_is_counted_as_such() {
 }
 
 #[test]
-fn strangers_are_not_let_in() {
+fn unknown_clients_are_refused() {
     let folder = tempfile::tempdir().unwrap();
     let keys = keys_for(&folder.path().join("ours"), &["agent-1", "ego-1"]);
     let theirs = keys_for(&folder.path().join("theirs"), &["agent-1"]);
-    // Of our authority, and for a few seconds only.
+    // Of the same authority, and for a few seconds only.
     let plan = KeyPlan::new(&keys, vec!["agent-3".parse().unwrap()], 1);
     make(&KeyPlan { lifetime: Duration::from_secs(1), ..plan }).unwrap();
     let router = GuardedRouter::open(&keys);
@@ -231,7 +232,7 @@ fn strangers_are_not_let_in() {
     let expired = Credentials::read(&keys.join("agent-3")).unwrap_err().to_string();
     assert!(expired.contains("agent-3 expired"), "{expired}");
     let plain = || {
-        // Past our own check of endpoints: the same port, of TCP.
+        // Without the bus's own check of endpoints: the same port, of TCP.
         let text = router.endpoint.as_str().replace("quic/", "tcp/");
         let mut options = BusOptions::client(text.parse().unwrap());
         options.patience = TRIED_FOR;
@@ -243,7 +244,7 @@ fn strangers_are_not_let_in() {
         let expired = scope.spawn(|| stranger(&router.endpoint, &keys.join("agent-1"), Some(&keys.join("agent-3"))));
         let no_certificate = scope.spawn(|| stranger(&router.endpoint, &keys.join("agent-1"), None));
         let plain = scope.spawn(plain);
-        // Nor do we speak to a router of another authority.
+        // Nor does a client connect to a router of another authority.
         let our_side =
             scope.spawn(|| stranger(&router.endpoint, &theirs.join("agent-1"), Some(&theirs.join("agent-1"))));
         for (what, tried) in
@@ -271,7 +272,7 @@ fn a_certificate_that_runs_out_ends_its_connection() {
     let watched = Arc::<Mutex<Vec<String>>>::default();
     let _watch = ego.watch(protocol::Role::Agent, {
         let watched = Arc::clone(&watched);
-        move |sighting| watched.lock().unwrap().push(format!("{sighting:?}"))
+        move |event| watched.lock().unwrap().push(format!("{event:?}"))
     });
     let _presence = agent.announce(protocol::Role::Agent).unwrap();
     wait_for("the end of a certificate", || watched.lock().unwrap().iter().any(|text| text.starts_with("Vanished")));
@@ -282,9 +283,9 @@ fn large_messages_come_whole_and_in_order() {
     const COUNT: u64 = 8;
     let folder = tempfile::tempdir().unwrap();
     let router = GuardedRouter::open(&keys_for(folder.path(), &["agent-1", "ego-1"]));
-    let [agent, ego] = ["agent-1", "ego-1"].map(|party| router.join(party));
+    let [agent, ego] = ["agent-1", "ego-1"].map(|principal| router.join(principal));
     let inbox = ego.inbox(64, 8);
-    // 8 MiB each. Whoever is told of the second subscription has been told of the first.
+    // 8 MiB each. A peer that has received the second subscription has received the first.
     let cloud = |tick: u64| PointCloud { xyzi: vec![[tick as f32, 2.0, 3.0, 0.5]; 1 << 19] };
     let _subscriptions = ["1/points", "1/pose"].map(|text| ego.subscribe(topic(text), &inbox).unwrap());
     reaches(&agent, "1/pose", &inbox);
@@ -293,7 +294,7 @@ fn large_messages_come_whole_and_in_order() {
     for tick in 0..COUNT {
         let arrival = loop {
             match next_event(&inbox) {
-                (heard, Event::Message(arrival)) if heard == topic("1/points") => break arrival,
+                (found, Event::Message(arrival)) if found == topic("1/points") => break arrival,
                 _ => {}
             }
         };
@@ -303,15 +304,15 @@ fn large_messages_come_whole_and_in_order() {
 }
 
 #[test]
-fn what_is_too_large_goes_nowhere_and_disturbs_nobody() {
+fn a_message_over_the_size_limit_is_refused_and_others_are_not_affected() {
     let folder = tempfile::tempdir().unwrap();
     let router = GuardedRouter::open(&keys_for(folder.path(), &["agent-1", "agent-2", "ego-1"]));
-    let [agent, honest, ego] = ["agent-1", "agent-2", "ego-1"].map(|party| router.join(party));
+    let [agent, honest, ego] = ["agent-1", "agent-2", "ego-1"].map(|principal| router.join(principal));
     let inbox = ego.inbox(64, 8);
     let topics = ["1/pose", "2/pose", "1/bev"];
     let _subscriptions = topics.map(|text| ego.subscribe(topic(text), &inbox).unwrap());
     reaches(&agent, "1/pose", &inbox);
-    // More than a router takes of anyone, and more than a pose ever has.
+    // More than a router accepts from any peer, and more than a pose ever has.
     for (text, bytes) in [("1/bev", 40 << 20), ("1/pose", 1 << 20)] {
         let _ = agent
             .session()
@@ -321,7 +322,7 @@ fn what_is_too_large_goes_nowhere_and_disturbs_nobody() {
     }
     reaches(&honest, "2/pose", &inbox);
     reaches(&agent, "1/pose", &inbox);
-    assert_eq!(router.refused("agent-1", "put"), 1, "the pose; of the map nothing was ever whole");
+    assert_eq!(router.refused("agent-1", "put"), 1, "the pose; the map was never complete");
     let unsound = |text| {
         let here = protocol::Account::towards(topic(text), &ego.identity().process);
         ego.books()

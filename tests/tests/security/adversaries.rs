@@ -1,5 +1,5 @@
-//! A fleet with keys among strangers and liars: each is refused, counted and named, and the boxes are those of a run without
-//! them, box for box. The lines of the table in deploy/results/security.md that are about who speaks.
+//! Fleet with keys among unknown clients and an attacker: each is refused, counted and named, and the boxes are those
+//! of a run without them, box for box. The rows of the table in deploy/results/security.md about access control.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -19,7 +19,7 @@ use zenoh::qos::CongestionControl;
 use zenoh::{Session, Wait};
 
 const TICKS: usize = 6;
-/// What a liar with a certificate of the fleet tries, and the certificate's own vehicle is 666.
+/// Topics that an attacker with a certificate of the fleet tries; the certificate's own vehicle is 666.
 const FORGED: [&str; 8] =
     ["4288/bev", "4279/bev", "*/bev", "**", "4279/detections", "rx/4279/4288/bev", "truth", "ready/ego-4279"];
 
@@ -30,7 +30,7 @@ fn scenario(folder: &Path, rest: &str) -> PathBuf {
     path
 }
 
-/// What of a run must not depend on who else was there.
+/// Results of a run that must not depend on other peers.
 fn boxes(run: &Path) -> Vec<Value> {
     let of_interest = |result: &Value| {
         let fused: Vec<&Value> =
@@ -40,8 +40,8 @@ fn boxes(run: &Path) -> Vec<Value> {
     results(run).iter().map(of_interest).collect()
 }
 
-/// Puts what is not its to say, again and again; what the network does not take at once it lets go.
-fn lie(session: &Session, is_over: &AtomicBool) {
+/// Publishes on topics of others, repeatedly; messages that the network does not take at once are dropped.
+fn forge(session: &Session, is_over: &AtomicBool) {
     let _other = session.liveliness().declare_token("v2v/test/alive/agent/4288").wait();
     let _answers = session.declare_queryable("v2v/test/nobody").callback(|_| ()).wait();
     while !is_over.load(Ordering::Relaxed) {
@@ -56,7 +56,7 @@ fn lie(session: &Session, is_over: &AtomicBool) {
     }
 }
 
-fn liar(endpoint: &Endpoint, keys: &Path) -> Bus {
+fn attacker(endpoint: &Endpoint, keys: &Path) -> Bus {
     let credentials = Credentials::read(&keys.join("agent-666")).unwrap();
     let options = BusOptions::client(endpoint.clone()).with_credentials(credentials);
     let identity =
@@ -64,7 +64,7 @@ fn liar(endpoint: &Endpoint, keys: &Path) -> Bus {
     Bus::join(&options, identity).expect("it has a certificate")
 }
 
-/// Keys of the same authority that have run out.
+/// Expired keys of the same authority.
 fn expired_keys(keys: &Path) -> PathBuf {
     let plan = KeyPlan::new(keys, vec!["agent-667".parse().unwrap()], 1);
     make(&KeyPlan { lifetime: Duration::from_secs(1), ..plan }).unwrap();
@@ -73,8 +73,8 @@ fn expired_keys(keys: &Path) -> PathBuf {
     keys.join("agent-667")
 }
 
-/// Those without a certificate that the fleet takes: none gets in.
-fn strangers(endpoint: &Endpoint, keys: &Path, expired: &Path, theirs: &Path) {
+/// Clients without a certificate that the fleet accepts: none is admitted.
+fn unknown_clients(endpoint: &Endpoint, keys: &Path, expired: &Path, theirs: &Path) {
     let authority = keys.join("agent-4288");
     let ways = [("another authority", Some(theirs)), ("expired", Some(expired)), ("no certificate", None)];
     std::thread::scope(|scope| {
@@ -89,10 +89,10 @@ fn strangers(endpoint: &Endpoint, keys: &Path, expired: &Path, theirs: &Path) {
 }
 
 #[test]
-fn strangers_and_liars_change_nothing() {
+fn unknown_clients_and_an_attacker_change_nothing() {
     let _exclusive = exclusive_lock();
     let folder = tempfile::tempdir().unwrap();
-    // With keys of its own, which are gone afterwards.
+    // With keys of its own, which are deleted afterwards.
     let calm = folder.path().join("calm");
     let mut up = Up::start(&calm, &scenario(&calm, "security: {}"));
     assert_eq!(up.wait().code(), Some(0));
@@ -116,22 +116,22 @@ fn strangers_and_liars_change_nothing() {
     );
     let scenario = scenario(&stormy, &rest);
     let mut up = Up::start(&stormy, &scenario);
-    let said = up.wait_for_line("run test at");
-    assert!(said.contains(endpoint.as_str()), "with keys a router speaks QUIC whatever is written: {said}");
+    let line = up.wait_for_line("run test at");
+    assert!(line.contains(endpoint.as_str()), "with keys a router uses QUIC for any configured protocol: {line}");
 
     let is_over = Arc::new(AtomicBool::new(false));
-    let liar = liar(&endpoint, &keys);
-    let lying = std::thread::spawn({
-        let (session, is_over) = (liar.session().clone(), Arc::clone(&is_over));
-        move || lie(&session, &is_over)
+    let attacker = attacker(&endpoint, &keys);
+    let forging = std::thread::spawn({
+        let (session, is_over) = (attacker.session().clone(), Arc::clone(&is_over));
+        move || forge(&session, &is_over)
     });
-    strangers(&endpoint, &keys, &expired, &theirs);
+    unknown_clients(&endpoint, &keys, &expired, &theirs);
     // And once more while the fleet drives.
     let trying = std::thread::spawn({
         let (endpoint, keys) = (endpoint.clone(), keys.clone());
-        move || strangers(&endpoint, &keys, &expired, &theirs)
+        move || unknown_clients(&endpoint, &keys, &expired, &theirs)
     });
-    // The fleet has waited for its second vehicle, which comes from somewhere else.
+    // The fleet has waited for its second vehicle, which is started elsewhere.
     let mut agent = Command::new(programs().join("agent"))
         .args(["run", "--cav=4288", "--run=test", "--pose-source=recorded"])
         .arg(format!("--connect={endpoint}"))
@@ -141,7 +141,7 @@ fn strangers_and_liars_change_nothing() {
         .unwrap();
     let status = up.wait();
     is_over.store(true, Ordering::Relaxed);
-    lying.join().unwrap();
+    forging.join().unwrap();
     trying.join().unwrap();
     let came = agent.wait().unwrap();
     if !came.success() || status.code() != Some(0) {
@@ -174,5 +174,5 @@ fn strangers_and_liars_change_nothing() {
     let known = ["agent-666", "stranger"];
     assert!(refused.iter().all(|line| known.contains(&line["peer"].as_str().unwrap())), "{refused:?}");
     let modes = fs::read_to_string(up.folder.join("scenario.yaml")).unwrap();
-    assert!(modes.contains("security"), "the run says that it had keys");
+    assert!(modes.contains("security"), "the run reports that it had keys");
 }

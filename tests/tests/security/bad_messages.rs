@@ -1,5 +1,5 @@
-//! Every sort of bad message from a neighbour, through real sessions: refused, counted under its name, and the ego's
-//! detections are bit for bit what they are without.
+//! Every kind of invalid message from a neighbour, through real sessions: refused, counted under its name, and the
+//! ego's detections are bit for bit those without them.
 
 use std::collections::BTreeMap;
 
@@ -64,7 +64,7 @@ impl Neighbour {
     fn join(router: &TestRouter, name: &str, place: usize) -> Self {
         let bus = router.join(&format!("agent-{name}"), name);
         let presence = bus.announce(Role::Agent).unwrap();
-        // It probes its route; what is said is put by hand.
+        // It probes its route; its messages are put by the test.
         let publisher = bus.publisher(bev_of(name), PublisherOptions::FEATURES).unwrap();
         let route = Route { topic: bev_of(name), receiver: "ego-10".parse().unwrap() };
         Barrier::new([route]).await_routes(&bus).unwrap().wait(PATIENCE).unwrap();
@@ -81,7 +81,7 @@ impl Neighbour {
 
     fn see(&mut self, scenario: &Scenario, tick: usize) -> (u64, PoseEstimate, BevFeatures) {
         let frame = scenario.load(self.place, tick, &LoadOptions::default()).unwrap();
-        // Late enough that there is a past.
+        // Late enough for earlier times to exist.
         let capture_nanos = HOUR_NANOS + scenario.ticks[tick].capture_nanos;
         let measured_pose = frame.world_from_lidar.as_ref();
         let output = self.agent.process(&AgentInput { capture_nanos, cloud: &frame.points, measured_pose }).unwrap();
@@ -102,10 +102,10 @@ impl Neighbour {
         self.put(bytes);
     }
 
-    /// Everything that is wrong with messages, and what it is to be called. All of it behind a message of `tick`.
+    /// Every kind of invalid message, with the expected drop reason. All of them after a message of `tick`.
     fn bad(&mut self, scenario: &Scenario, tick: usize) -> Vec<(&'static str, DropReason, Vec<u8>)> {
         let (seen, pose, features) = self.see(scenario, tick);
-        // Of a time of its own, as a second message of one time is a duplicate whatever it says.
+        // With a capture time of its own, as a second message of one time is a duplicate whatever its content.
         let now = seen + 10_000_000;
         let mut fresh = |capture: u64| sealed(&self.stamp(capture), pose, features.clone());
         let [_, y, z] = pose.world_from_cav().unwrap().translation_m;
@@ -137,7 +137,7 @@ impl Neighbour {
         bad.push(("another shape", DropReason::Shape, sealed(&self.stamp(now), pose, fewer.clone())));
         let wider = BevGrid { cell_m: 2.0 * fewer.grid.cell_m, ..fewer.grid };
         bad.push((
-            "another lattice",
+            "another BEV grid",
             DropReason::Shape,
             sealed(&self.stamp(now), pose, BevFeatures { grid: wider, ..fewer }),
         ));
@@ -177,7 +177,7 @@ fn with_number(mut bytes: Vec<u8>, old: [f64; 2], new: f64) -> Vec<u8> {
     resealed(bytes)
 }
 
-/// A few kilobytes that unpack to 64 MiB, where 8 KiB are announced.
+/// A few kilobytes that decompress to 64 MiB, where 8 KiB are announced.
 fn bomb(stamp: &Stamp, pose: PoseEstimate, grid: BevGrid) -> Vec<u8> {
     let zeros = zstd::bulk::compress(&vec![0; 64 << 20], 1).unwrap();
     let codec = Codec { dtype: Dtype::F32, selection: Selection::Dense, packing: Compression::Zstd };
@@ -185,7 +185,7 @@ fn bomb(stamp: &Stamp, pose: PoseEstimate, grid: BevGrid) -> Vec<u8> {
     wire::encode(stamp, Bev { pose, features }).unwrap().to_vec()
 }
 
-/// Plays the scene; what the ego detected, and how it booked what 20 said.
+/// Plays the scene; the ego's detections, and its counters for the messages of 20.
 fn play(scenario: &Scenario, is_hostile: bool) -> (Vec<Vec<Detection>>, Counts, BTreeMap<DropReason, u64>) {
     let (router, stop) = (TestRouter::open(), Stop::new());
     let scorer = router.join("scorer", "scorer");
@@ -212,7 +212,7 @@ fn play(scenario: &Scenario, is_hostile: bool) -> (Vec<Vec<Detection>>, Counts, 
                 for (name, reason, bytes) in other.bad(scenario, tick - 1) {
                     *expected.entry(reason).or_default() += 1;
                     other.put(bytes);
-                    // One at a time: where many wait, the newest takes the place of the oldest unseen.
+                    // One at a time: if many wait, the newest replaces the oldest unread.
                     let all: u64 = expected.values().sum();
                     wait_for(name, || counts(&books.ledger()).dropped_total() == all);
                     let counts = counts(&books.ledger());
@@ -231,7 +231,7 @@ fn play(scenario: &Scenario, is_hostile: bool) -> (Vec<Vec<Detection>>, Counts, 
     })
 }
 
-/// What the ego's books say of the messages of 20.
+/// The ego's counters for the messages of 20.
 fn counts(ledger: &Ledger) -> Counts {
     let account = Account::towards(bev_of("20"), &process_id(Role::Ego, &cav("10")));
     ledger.get(&account).cloned().unwrap_or_default()
@@ -242,12 +242,12 @@ fn bad_messages_are_refused_counted_and_named_and_change_nothing() {
     let folder = tempfile::tempdir().unwrap();
     scene::write(folder.path(), &["10", "20"], TICKS);
     let scenario = dataset::open(folder.path()).unwrap().scenarios.remove(0);
-    let (alone, quiet, nothing) = play(&scenario, false);
+    let (undisturbed, quiet, nothing) = play(&scenario, false);
     assert!(quiet.dropped.is_empty() && nothing.is_empty(), "{quiet:?}");
-    let (attacked, booked, expected) = play(&scenario, true);
-    assert!(alone.iter().any(|detections| !detections.is_empty()), "nothing to compare");
-    assert_eq!(alone, attacked, "the same boxes, so the same AP");
-    assert_eq!(booked.dropped, expected);
-    assert_eq!(booked.received, TICKS as u64);
+    let (attacked, counted, expected) = play(&scenario, true);
+    assert!(undisturbed.iter().any(|detections| !detections.is_empty()), "nothing to compare");
+    assert_eq!(undisturbed, attacked, "the same boxes, so the same AP");
+    assert_eq!(counted.dropped, expected);
+    assert_eq!(counted.received, TICKS as u64);
     assert!(expected.len() >= 9, "every reason that a message's contents can give: {expected:?}");
 }

@@ -1,5 +1,5 @@
-//! A fleet on three hosts over QUIC: a router, a vehicle and an ego, each in a network namespace with a cable to the router.
-//! What `deploy/hosts.md` tells to type is what runs here.
+//! Fleet on three hosts over QUIC: a router, a vehicle and an ego, each in a network namespace with a virtual link to
+//! the router. The commands are those of `deploy/hosts.md`.
 
 use std::fs;
 use std::path::Path;
@@ -13,10 +13,10 @@ use tests::locks::exclusive_lock;
 
 const TICKS: usize = 8;
 const PORT: u16 = 7447;
-/// Longer than anything takes here, under whatever load.
+/// Longer than any step takes, under any load.
 const PATIENCE: Duration = Duration::from_secs(120);
 
-/// A process on one of the hosts; killed where it is left behind.
+/// A process on one of the hosts; killed when dropped.
 struct Running(Child);
 
 impl Running {
@@ -64,9 +64,9 @@ fn a_fleet_spans_three_hosts_over_quic() {
         .unwrap();
     assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
 
-    let run = |host: &str, program: &str, words: &[&str], holder: &str| {
+    let run = |host: &str, program: &str, arguments: &[&str], holder: &str| {
         let mut command = hosts.command(host, &programs().join(program));
-        command.args(words).arg(format!("--keys={}", keys.join(holder).display()));
+        command.args(arguments).arg(format!("--keys={}", keys.join(holder).display()));
         if program != "v2vloc" {
             let index = usize::from(host == "ego");
             command.args(["--run=test".to_owned(), format!("--connect=quic/{}:{PORT}", router_address(index))]);
@@ -78,10 +78,10 @@ fn a_fleet_spans_three_hosts_over_quic() {
     let router = run("router", "v2vloc", &["router", &format!("--listen=quic/0.0.0.0:{PORT}")], "router");
     let far = run("vehicle", "agent", &["run", "--cav=4288", &weights], "agent-4288");
     let near = run("ego", "agent", &["run", "--cav=4279", &weights], "agent-4279");
-    let words = ["run", "--ego=4279", "--method=max", "--deadline-ms=60000", "--json", &weights];
-    let ego = run("ego", "ego-fuser", &words, "ego-4279");
+    let arguments = ["run", "--ego=4279", "--method=max", "--deadline-ms=60000", "--json", &weights];
+    let ego = run("ego", "ego-fuser", &arguments, "ego-4279");
     let scene = path("scene");
-    let words = [
+    let arguments = [
         "stream",
         scene.to_str().unwrap(),
         "--lockstep",
@@ -90,15 +90,15 @@ fn a_fleet_spans_three_hosts_over_quic() {
         "--expect=4279/bev>ego-4279",
         "--json",
     ];
-    // The scene lies with the router; from there it is 10.78.1.1 that it goes to.
-    let replay = run("router", "sim-replay", &words, "replay");
+    // The scene is on the router's host; there the endpoint is 10.78.1.1.
+    let replay = run("router", "sim-replay", &arguments, "replay");
 
-    // Somebody on the vehicle's host without keys, on the router's port.
-    let mut stranger = hosts.command("vehicle", &programs().join("sim-replay"));
-    stranger.args(["record", "--run=test", "--connect-timeout-s=2", "--out"]).arg(path("stolen.mcap"));
-    stranger.arg(format!("--connect=tcp/{}:{PORT}", router_address(0)));
-    let stranger = start(&mut stranger, &path("stranger.log")).end();
-    assert!(!stranger.status.success(), "plain TCP is not taken");
+    // A client on the vehicle's host without keys, on the router's port.
+    let mut unknown = hosts.command("vehicle", &programs().join("sim-replay"));
+    unknown.args(["record", "--run=test", "--connect-timeout-s=2", "--out"]).arg(path("stolen.mcap"));
+    unknown.arg(format!("--connect=tcp/{}:{PORT}", router_address(0)));
+    let unknown = start(&mut unknown, &path("unknown.log")).end();
+    assert!(!unknown.status.success(), "plain TCP is not taken");
 
     let log = |holder: &str| fs::read_to_string(path(&format!("{holder}.log"))).unwrap_or_default();
     let played = replay.end();
@@ -111,7 +111,7 @@ fn a_fleet_spans_three_hosts_over_quic() {
     }
     signal(router.0.id(), "TERM");
     assert!(router.end().status.success());
-    // On a busy machine a client gives up a handshake, and begins another.
+    // On a busy machine a client abandons a handshake, and begins another.
     let refused = log("router").lines().any(|line| line.contains("refused peer=") && !line.contains("stranger"));
     assert!(!refused, "{}", log("router"));
 }

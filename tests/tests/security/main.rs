@@ -1,4 +1,5 @@
-//! Security: certificates, access control, messages refused, misbehaviour, and the texts of zenoh that their counters read.
+//! Security: certificates, access control, rejected messages, misbehaviour detection, and the log texts of zenoh behind
+//! the counters.
 
 mod access_control;
 mod adversaries;

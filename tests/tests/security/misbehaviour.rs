@@ -1,12 +1,12 @@
-//! A fleet with a liar in it, as a person runs it: the ego finds out who lies and why it thinks so, says so everywhere, and
-//! sees what it would see if the liar had never spoken.
+//! Fleet with an attacker: the ego detects it, reports the reason everywhere, and its detections are those without the
+//! attacker's messages.
 
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;
 
-use deploy::experiment::metrics::Metrics;
 use deploy::operate::status::RunStatus;
+use deploy::score::metrics::Metrics;
 use protocol::{DetectionsReport, DropReason};
 use simulator::generate::{Subset, SynthOptions, generate};
 use tests::fleet::Up;
@@ -17,7 +17,7 @@ const FRAMES: usize = 6;
 /// Results of the ego by capture time.
 type Results = BTreeMap<u64, DetectionsReport>;
 
-/// Plays the scene with the shipped detector; `rest` is added to what is common to all fleets here.
+/// Plays the scene with the released detector; `rest` is added to the settings that all fleets here share.
 fn play(folder: &Path, scene: &str, rest: &str) -> (Results, Metrics, RunStatus) {
     let weights = Path::new(env!("CARGO_MANIFEST_DIR")).with_file_name("deploy").join("weights/lean-max.safetensors");
     let path = folder.join("scenario.yaml");
@@ -28,7 +28,7 @@ fn play(folder: &Path, scene: &str, rest: &str) -> (Results, Metrics, RunStatus)
     );
     fs::write(&path, text).unwrap();
     let mut up = Up::start(folder, &path);
-    assert_eq!(up.wait().code(), Some(0), "whom nobody believes loses nothing");
+    assert_eq!(up.wait().code(), Some(0), "an excluded neighbour's messages are not lost");
     let lines = fs::read_to_string(up.folder.join("detections.jsonl")).unwrap();
     let results = lines.lines().map(|line| serde_json::from_str::<DetectionsReport>(line).unwrap());
     let results: Results = results.map(|report| (report.capture_nanos, report)).collect();
@@ -38,7 +38,7 @@ fn play(folder: &Path, scene: &str, rest: &str) -> (Results, Metrics, RunStatus)
 }
 
 #[test]
-fn a_liar_in_a_live_fleet_is_found_out_named_and_without_effect() {
+fn an_attacker_in_a_live_fleet_is_detected_named_and_without_effect() {
     let _exclusive = exclusive_lock();
     let (with, without) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
     for folder in [&with, &without] {
@@ -50,17 +50,17 @@ fn a_liar_in_a_live_fleet_is_found_out_named_and_without_effect() {
         generate(&options, &|_| {}).unwrap();
     }
     let agents = dataset::open(&with.path().join("scene")).unwrap().scenarios.remove(0).agents;
-    let [ego, honest, liar] = &agents[..] else { panic!("{agents:?}") };
+    let [ego, honest, attacker] = &agents[..] else { panic!("{agents:?}") };
 
-    let (lied, metrics, status) = play(with.path(), "", &format!("vehicles: {{'{liar}': {{lie: noise}}}}"));
+    let (attacked, metrics, status) = play(with.path(), "", &format!("vehicles: {{'{attacker}': {{lie: noise}}}}"));
     let (expected, ..) = play(without.path(), &format!("agents: ['{ego}', '{honest}']"), "");
 
     // One message of noise may be anything; two that follow each other cannot be of one vehicle.
     let is_out = |report: &DetectionsReport| {
-        let left_out = report.result.skipped.iter().find(|skipped| skipped.cav == *liar);
+        let left_out = report.result.skipped.iter().find(|skipped| skipped.cav == *attacker);
         left_out.is_some_and(|skipped| skipped.reason == Some(DropReason::Distrusted))
     };
-    let out: Vec<_> = lied.iter().filter(|(_, report)| is_out(report)).collect();
+    let out: Vec<_> = attacked.iter().filter(|(_, report)| is_out(report)).collect();
     assert!(out.len() >= FRAMES - 1, "left out of {} frames", out.len());
     assert!(expected.values().any(|report| !report.result.detections.is_empty()), "something is there to be seen");
     for (at, report) in out {
@@ -68,13 +68,13 @@ fn a_liar_in_a_live_fleet_is_found_out_named_and_without_effect() {
         assert!(report.result.fused.iter().all(|fused| fused.cav == *honest) && report.result.fused.len() == 1);
     }
 
-    let [told, named] = [honest, liar].map(|cav| &metrics.neighbours[cav]);
-    assert_eq!((told.fused, told.doubts.len(), told.doubt), (FRAMES as u64, 0, None), "{told:?}");
+    let [trusted, named] = [honest, attacker].map(|cav| &metrics.neighbours[cav]);
+    assert_eq!((trusted.fused, trusted.doubts.len(), trusted.doubt), (FRAMES as u64, 0, None), "{trusted:?}");
     assert!(named.doubt.is_some() && named.fused <= 1 && named.trust.is_some_and(|trust| trust < 0.3), "{named:?}");
     assert!(named.left_out[&DropReason::Distrusted] >= FRAMES as u64 - 1);
     // One machine has one clock.
-    assert!(told.clock_offset_s.is_some_and(|offset_s| (-60.0..=0.001).contains(&offset_s)), "{told:?}");
-    let shown = status.neighbours.iter().find(|neighbour| neighbour.cav == *liar).unwrap();
+    assert!(trusted.clock_offset_s.is_some_and(|offset_s| (-60.0..=0.001).contains(&offset_s)), "{trusted:?}");
+    let shown = status.neighbours.iter().find(|neighbour| neighbour.cav == *attacker).unwrap();
     assert_eq!((shown.doubt, shown.trust), (named.doubt, named.trust));
-    assert!(status.table().contains("left out: "), "{}", status.table());
+    assert!(status.table().contains("left out because"), "{}", status.table());
 }

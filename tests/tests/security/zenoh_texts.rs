@@ -1,7 +1,7 @@
-//! Contract of the pinned zenoh version: the texts of its log and of its metrics from which a router's refusals are counted.
+//! Contract with the pinned zenoh version: the texts of its log and metrics from which a router's refusals are counted.
 //!
-//! Each failure is provoked exactly once and counted exactly once. When an update of zenoh, quinn or rustls words one of them
-//! otherwise, a count here is missing: see `handshakes.rs` and `refusals.rs` of the bus.
+//! Each failure is provoked exactly once and counted exactly once. When an update of zenoh, quinn or rustls changes one
+//! of the texts, a count here is missing: see `handshakes.rs` and `refusals.rs` of the bus.
 
 use std::collections::BTreeMap;
 use std::fs::{self, File};
@@ -23,10 +23,10 @@ use tests::keys::{keys_for, stranger};
 use tests::locks::exclusive_lock;
 use zenoh::Wait;
 
-/// Longest size of a datagram of QUIC.
+/// Largest size of a datagram of QUIC, bytes.
 const DATAGRAM_BYTES: usize = 65_536;
 
-/// `v2vloc router` as a process: what zenoh logs is counted per process.
+/// `v2vloc router` as a process: zenoh's log is counted per process.
 struct RouterProcess {
     child: Child,
     endpoint: Endpoint,
@@ -63,7 +63,7 @@ impl RouterProcess {
         log.lines().filter_map(count).collect()
     }
 
-    /// Ends the router, which looks at its refusals once more; the counts.
+    /// Ends the router, which reads its refusals once more; returns the counts.
     fn end(mut self) -> BTreeMap<String, u64> {
         signal(self.child.id(), "TERM");
         assert!(self.child.wait().unwrap().success(), "{}", self.log());
@@ -78,7 +78,7 @@ impl Drop for RouterProcess {
     }
 }
 
-/// Hands the first datagram of a client on to the router, and nothing back.
+/// Forwards the first datagram of a client to the router, and nothing back.
 fn first_datagram_only(router: &Endpoint) -> Endpoint {
     let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
     let relay = Endpoint::loopback(socket.local_addr().unwrap().port()).secured();
@@ -94,7 +94,7 @@ fn first_datagram_only(router: &Endpoint) -> Endpoint {
 
 #[test]
 fn each_failed_handshake_is_counted_once_under_its_cause() {
-    // A client that gets no processor time gives up a handshake and counts under another cause.
+    // A client without processor time abandons a handshake and counts under another cause.
     let _exclusive = exclusive_lock();
     programs();
     let folder = tempfile::tempdir().unwrap();
@@ -114,10 +114,10 @@ fn each_failed_handshake_is_counted_once_under_its_cause() {
         (&router.endpoint, &ours, None),
         // The client refuses the router, whose certificate is for other addresses.
         (&elsewhere, &ours, Some(ours.as_path())),
-        // Last: zenoh takes one handshake after the other, and the unfinished one keeps it half a minute.
+        // Last: zenoh takes one handshake after the other, and the incomplete one keeps it half a minute.
         (&relay, &ours, Some(ours.as_path())),
     ] {
-        assert!(stranger(endpoint, authority, own).is_err(), "{own:?} is let in at {endpoint}");
+        assert!(stranger(endpoint, authority, own).is_err(), "{own:?} is admitted at {endpoint}");
     }
     let causes = [
         "begun and not finished",

@@ -60,7 +60,7 @@ fn evaluate(weights: PathBuf, scene: &Path, method: Method, dtype: Dtype) -> Vec
 fn a_training_that_was_interrupted_ends_like_one_that_was_not() {
     let (_generator, _scenes, scene) = begin();
     let (whole, parts) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
-    // The learning rate follows the share that is done, so a stop in the middle is a checkpoint of the whole length.
+    // The learning rate follows the completed fraction, so an early stop is a checkpoint of the whole length.
     let uninterrupted = config(&scene, whole.path(), Method::ATTENTION, 10);
     let (summary, ear) = run(&uninterrupted);
     assert_eq!((summary.trained.steps, ear.validations.as_slice()), (10, [5, 10].as_slice()));
@@ -79,12 +79,12 @@ fn a_training_that_was_interrupted_ends_like_one_that_was_not() {
     assert_eq!(columns, [12; 4], "a header, one report, two validations:\n{curve}");
 }
 
-/// Trains and pulls the plug in the first report after the first checkpoint; the steps of that checkpoint.
+/// Trains and interrupts in the first report after the first checkpoint; the steps of that checkpoint.
 fn train_until_checkpoint(config: &TrainConfig) -> u64 {
     struct Plug(PathBuf);
     impl Observer for Plug {
         fn stepped(&mut self, _: &StepReport) {
-            // The report of step 10 comes before the checkpoint of step 10: what lies there is of step 5.
+            // The report of step 10 comes before the checkpoint of step 10: the existing one is of step 5.
             assert!(self.0.exists(), "a checkpoint at step 5");
             panic!("pulled");
         }
@@ -120,7 +120,7 @@ fn every_method_that_learns_trains_and_evaluates_the_same_twice() {
 }
 
 #[test]
-fn half_precision_on_the_air_takes_half_the_bytes() {
+fn half_precision_takes_half_the_bytes_of_a_message() {
     let (_generator, _scenes, scene) = begin();
     let folder = tempfile::tempdir().unwrap();
     let (summary, _) = run(&config(&scene, folder.path(), Method::NONE, 5));

@@ -1,4 +1,4 @@
-//! A localizer from nothing: generated drives, an encoder, a head, and poses from sweeps alone.
+//! Localizer from random weights: generated drives, an encoder, a head, and poses from sweeps only.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -113,7 +113,7 @@ fn a_localizer_learns_two_drives_and_finds_itself_on_them() {
     }
     assert!(found >= 7, "{found} of 12");
 
-    // What cannot be localised is said, not made up.
+    // A sweep that cannot be localised has a reason and no pose.
     let nan = PointCloud { xyzi: vec![[f32::NAN; 4]; 5000] };
     let few = PointCloud { xyzi: (0..10).map(|k| [k as f32, 3.0, 0.5, 0.1]).collect() };
     for cloud in [PointCloud::default(), nan, few] {
@@ -156,7 +156,7 @@ fn competitors_learn_on_the_features_of_an_encoder_that_stays_as_it_is() {
         .unwrap();
         assert!(encoded == 48 && errors.last().unwrap() < &(0.7 * errors[0]), "{regresses:?}: {errors:?}");
 
-        // In the file lie the layers that were trained, behind the encoder as it was.
+        // The file holds the trained layers, after the unchanged encoder.
         let localizer = EndToEndLocalizer::load(&trained.weights, Device::Cpu).unwrap();
         assert_eq!(localizer.config().encoder, small_encoder());
         let (before, after) = (VarStore::new(Device::Cpu), VarStore::new(Device::Cpu));
@@ -211,5 +211,5 @@ fn trainings_go_on_where_they_stopped_and_refuse_what_is_not_theirs() {
     let bytes = std::fs::read(&checkpoint).unwrap();
     std::fs::write(&checkpoint, &bytes[..bytes.len() / 2]).unwrap();
     let message = train_encoder(&going_on(30), &mut |_| ()).unwrap_err().to_string();
-    assert!(message.contains("checkpoint.safetensors") && message.contains("not a whole"), "{message}");
+    assert!(message.contains("checkpoint.safetensors") && message.contains("not a complete"), "{message}");
 }

@@ -1,4 +1,5 @@
-//! Training: networks that learn on small scenes, stop and resume, and are evaluated. One at a time: all draw from one generator.
+//! Training: networks that learn on small scenes, stop and resume, and are evaluated. One at a time: they share a
+//! generator.
 
 mod fusion;
 mod localization;

@@ -1,5 +1,5 @@
-//! PASTAT end to end on a made scene: learnt behind a frozen encoder, with history, late neighbours and found poses, and
-//! judged in a table.
+//! PASTAT end to end on a generated scene: trained behind a frozen encoder, with history, late neighbours and estimated
+//! poses, and evaluated in a table.
 
 use std::fs;
 use std::ops::ControlFlow;
@@ -32,7 +32,7 @@ fn begin(folder: &Path) -> (PathBuf, PathBuf) {
     (data, summary.trained.weights)
 }
 
-/// Trains PASTAT behind the encoder of `init`, with everything that its samples can have.
+/// Trains PASTAT behind the encoder of `init`, with every option of its samples.
 fn pastat(folder: &Path, data: &Path, init: &Path, name: &str) -> TrainConfig {
     let noise = NoisyPoseConfig {
         mode: NoiseMode::Independent,
@@ -111,7 +111,7 @@ fn pastat_learns_behind_a_frozen_encoder_and_is_judged_with_late_messages() {
     let card = fs::read_to_string(first.run.out.join("model-card.md")).unwrap();
     assert!(card.contains("frozen") && card.contains("3 frames") && card.contains("0.3 s late"), "{card}");
 
-    // The same again, its maps being there: the same weights.
+    // The same again, with its maps cached: the same weights.
     let mut again = Ear::default();
     let repeated = train::run(&pastat(folder.path(), &data, &init, "again"), &mut again).unwrap();
     assert_eq!((again.encoded, repeated.trained.sha256), (0, summary.trained.sha256));
@@ -124,7 +124,7 @@ fn pastat_learns_behind_a_frozen_encoder_and_is_judged_with_late_messages() {
     let kept = evaluate(weights, &data, PoseSourceConfig::Recorded, 0, true);
     for ((frame, twice), kept) in frames.iter().zip(&twice).zip(&kept) {
         assert_eq!(frame.result.detections, twice.result.detections);
-        // A kept map has half precision where the head of the own agent has not: boxes may differ in the last bits.
+        // A cached map has half precision where the head of the own agent has not: boxes may differ in the last bits.
         assert_eq!(frame.result.fused, kept.result.fused);
         assert_eq!(frame.result.detections.len(), kept.result.detections.len());
     }
@@ -154,7 +154,7 @@ fn kept_maps_are_bounded_and_survive_a_cut() {
     let (few, encoded) = open(1);
     assert_eq!((few.sweeps(), encoded), ((1, AGENTS.len() * TICKS), 1), "no more once the limit is passed");
     assert!(few.map(0, 0, 0).unwrap().is_some() && few.map(0, 2, 3).unwrap().is_none());
-    // What is not kept is encoded when it is needed.
+    // A map that is not cached is encoded when it is needed.
     let mut maps = MapSource::new(few.into(), Weights::load(&init).unwrap().into());
     let live = maps.map(0, &scenarios[0], 2, 3).unwrap();
     let (whole, encoded) = open(u64::MAX);
@@ -191,7 +191,7 @@ fn parts_are_left_out_by_the_configuration_and_stay_out() {
     assert!(ablated(&max, &[Part::Ce], None).unwrap_err().to_string().contains("pastat"));
 }
 
-/// A table of the true poses, but for one vehicle that does not know where it is at tick 3.
+/// A table of the true poses, except for one vehicle without a pose at tick 3.
 fn poses(file: &Path, scenario: &Scenario) {
     let mut rows = Vec::new();
     for (agent, cav) in scenario.agents.iter().enumerate() {

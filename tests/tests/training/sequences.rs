@@ -1,4 +1,4 @@
-//! Localization benchmarks: drives in the layouts of NCLT and Oxford train and evaluate through the same commands as all others.
+//! Localization benchmarks: drives in the layouts of NCLT and Oxford train and evaluate through the common commands.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -74,7 +74,7 @@ fn sequences_of_both_benchmarks_train_and_evaluate_like_any_drive() {
     let _generator = random_generator_lock();
     let folder = tempfile::tempdir().unwrap();
     let drives = drives(folder.path());
-    // An encoder serves any town: the second benchmark takes the first one's.
+    // An encoder serves any town: the second benchmark uses the first one's.
     let mut encoder: Option<PathBuf> = None;
     for (benchmark, layout) in [(Benchmark::Nclt, Layout::Nclt), (Benchmark::Oxford, Layout::Oxford)] {
         let sequences = write(folder.path(), benchmark, &drives);
@@ -95,7 +95,7 @@ fn sequences_of_both_benchmarks_train_and_evaluate_like_any_drive() {
         let head = train_head_on(&sequences, encoder, &folder.path().join(format!("head-{layout:?}")));
         let summary = eval(&sequences, encoder, &head);
         assert_eq!(summary["sweeps"], 2 * (30 - 2 * LEFT_OUT));
-        // Points and poses that did not belong together would leave nothing to learn.
+        // Points and poses that do not belong together would leave nothing to learn.
         assert!(summary["success_3m"].as_f64().unwrap() > 0.4, "{layout:?}: {summary}");
         assert!(summary["p50_m"].as_f64().unwrap() < 3.0 && summary["p50_deg"].as_f64().unwrap() < 3.0, "{summary}");
         assert!(summary["ms"]["encode"].as_f64().unwrap() > 0.0, "{summary}");

@@ -1,18 +1,18 @@
-//! Competitors of the localizer that are trained end to end on one town: what the paper compares itself with. They are no
+//! Competitors of the localizer, trained end to end on one scene, for the comparison in the paper. They are no
 //! re-implementations of those works; each keeps their idea and leaves out what they build around it.
 //!
-//! `scene_coordinates` stands for SGLoc: coordinates of cells regressed without classification and without predicted error,
-//! all cells trusted alike by the solver. It has our encoder in place of SGLoc's, and neither its tri-scale attention nor
-//! its inter-geometric-consistency term.
+//! `scene_coordinates` stands for SGLoc: coordinates of cells regressed without classification and without predicted
+//! error; the solver weighs all cells equally. It has our encoder in place of SGLoc's, and neither its tri-scale
+//! attention nor its inter-geometric-consistency term.
 //!
 //! `pose` stands for absolute pose regression, HypLiLoc and DiffLoc: one network from a sweep to a pose. It has none of
-//! what these add to that idea (HypLiLoc's second branch on the spherical projection and its hyperbolic fusion; DiffLoc's
-//! foundation-model features and its denoising over a window of sweeps), and it regresses heading only, since vehicles
-//! stand upright.
+//! the additions of these works (HypLiLoc's second branch on the spherical projection and its hyperbolic fusion;
+//! DiffLoc's foundation-model features and its denoising over a window of sweeps), and it regresses heading only, since
+//! vehicles stand upright.
 //!
-//! Both have our encoder (`lean`), the localizer's sweeps and a comparable time of training, not the hours on a GPU that
-//! the papers spend: so the comparison is one of ideas at equal means. In that time a whole network learns nothing from
-//! nothing; with the localizer's own encoder, frozen, only its last layers have to.
+//! Both have our encoder (`lean`), the localizer's sweeps and a comparable time of training, not the GPU hours of the
+//! papers: the comparison is one of ideas at equal cost. In that time a network that starts from random weights does
+//! not converge; with the localizer's own encoder, frozen, only the last layers are trained.
 
 use serde::{Deserialize, Serialize};
 use tch::nn;
@@ -29,7 +29,7 @@ const WIDTH: i64 = 512;
 /// Unit of regressed coordinates, metres.
 const SCALE_M: f64 = 100.0;
 
-/// What is regressed.
+/// Target of the regression.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum EndToEndKind {
@@ -39,21 +39,21 @@ pub enum EndToEndKind {
     Pose,
 }
 
-/// A network that is trained end to end.
+/// Configuration of a network that is trained end to end.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct EndToEndConfig {
-    /// What is regressed.
+    /// Target of the regression.
     pub regresses: EndToEndKind,
-    /// Name of the town.
+    /// Name of the scene.
     pub town: String,
-    /// Middle of the training positions, metres in the world.
+    /// Centre of the training positions, metres in the world.
     pub origin_m: [f64; 3],
-    /// The encoder, trained with the rest.
+    /// The encoder, trained with the regressor.
     pub encoder: SceneEncoderConfig,
 }
 
-/// Encoder and regressor of one town.
+/// Encoder and regressor of one scene.
 #[derive(Debug)]
 pub struct EndToEnd {
     config: EndToEndConfig,
@@ -79,13 +79,13 @@ impl EndToEnd {
         Ok(Self { config: config.clone(), encoder, norm, layers })
     }
 
-    /// What it was built from.
+    /// Configuration that it was built from.
     #[must_use]
     pub fn config(&self) -> &EndToEndConfig {
         &self.config
     }
 
-    /// Its encoder.
+    /// Encoder.
     #[must_use]
     pub fn encoder(&self) -> &SceneEncoder {
         &self.encoder
@@ -94,7 +94,7 @@ impl EndToEnd {
     /// `[cells, 3]` world coordinates relative to the origin, metres, of some cells' features.
     ///
     /// # Errors
-    /// The tensor library's.
+    /// Those of the tensor library.
     pub fn coordinates(&self, cells: &Tensor) -> Result<Tensor, TchError> {
         Ok(self.regress(cells)? * SCALE_M)
     }
@@ -103,7 +103,7 @@ impl EndToEnd {
     /// features `[S, sweep_channels]` of whole sweeps.
     ///
     /// # Errors
-    /// The tensor library's.
+    /// Those of the tensor library.
     pub fn poses(&self, sweeps: &Tensor) -> Result<(Tensor, Tensor), TchError> {
         let output = self.regress(sweeps)?;
         let heading = output.f_narrow(1, 3, 2)?;
@@ -111,16 +111,16 @@ impl EndToEnd {
         Ok((output.f_narrow(1, 0, 3)? * SCALE_M, heading / norm))
     }
 
-    /// Takes what features look like, `[N, cell_channels]` or `[N, sweep_channels]`; without that they are regressed from as
-    /// they are.
+    /// Sets the normalisation from features `[N, cell_channels]` or `[N, sweep_channels]`; without it they enter
+    /// unchanged.
     ///
     /// # Errors
-    /// The tensor library's.
+    /// Those of the tensor library.
     pub fn set_statistics(&mut self, features: &Tensor) -> Result<(), TchError> {
         self.norm.fit(features)
     }
 
-    /// In single precision, whatever the encoder computes in: bfloat16 knows a place 200 m away to half a metre.
+    /// In single precision, whatever the encoder computes in: bfloat16 resolves a position 200 m away to half a metre.
     fn regress(&self, x: &Tensor) -> Result<Tensor, TchError> {
         let [first, second, third] = &self.layers;
         let x = second.forward(&first.forward(&self.norm.forward(x)?)?.f_relu()?)?.f_relu()?;

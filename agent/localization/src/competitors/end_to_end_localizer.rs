@@ -1,4 +1,4 @@
-//! The competitors at work: a sweep in, a pose out, through the same door as the localizer.
+//! Localization by the competitors: from a sweep to a pose, through the same trait as the localizer.
 
 use std::path::Path;
 use std::time::Instant;
@@ -17,13 +17,13 @@ use crate::pgc::voxel_batch::VoxelBatch;
 use crate::pgc::voxelise::SweepVoxels;
 use perception::weights::Weights;
 
-/// Confidence of a pose that is regressed directly: such a network has no notion of its error, and says so by none.
-const UNQUESTIONED: f32 = 1.0;
+/// Confidence of a pose that is regressed directly: such a network predicts no error.
+const FULL_CONFIDENCE: f32 = 1.0;
 
-/// A network that was trained end to end on one town, with what turns its answer into a pose.
+/// A network that was trained end to end on one scene, with the step from its output to a pose.
 ///
-/// Coordinates of cells go through the same solver as the localizer's, all cells weighing the same; there is no second
-/// look. The confidence is then the share of cells that agree. A directly regressed pose is taken as it is.
+/// Coordinates of cells go through the same solver as the localizer's, all cells with equal weight; there is no pose
+/// refinement. The confidence is then the inlier ratio. A directly regressed pose is used unchanged.
 #[derive(Debug)]
 pub struct EndToEndLocalizer {
     network: EndToEnd,
@@ -33,13 +33,13 @@ pub struct EndToEndLocalizer {
 }
 
 impl EndToEndLocalizer {
-    /// Kind of the weights, as their file says it.
+    /// Kind of the weights, as in their file.
     pub const KIND: &'static str = "end to end";
 
-    /// Reads what `agent train end-to-end` wrote; the file says what is regressed.
+    /// Reads the output of `agent train end-to-end`; the file names the target of the regression.
     ///
     /// # Errors
-    /// [`LocalizerError`] when the file is missing, cut off, of something else, or its tensors are not those of its
+    /// [`LocalizerError`] when the file is missing, truncated or of another kind, or its tensors are not those of its
     /// configuration.
     pub fn load(path: &Path, device: Device) -> Result<Self, LocalizerError> {
         let weights = Weights::load(path)?;
@@ -52,19 +52,19 @@ impl EndToEndLocalizer {
         Ok(Self { network, solver: PoseSolver::default(), device, sha256: weights.sha256().to_owned() })
     }
 
-    /// Hash of the weights.
+    /// SHA-256 of the weights.
     #[must_use]
     pub fn sha256(&self) -> &str {
         &self.sha256
     }
 
-    /// What is regressed, in which town.
+    /// Configuration: target of the regression, scene.
     #[must_use]
     pub fn config(&self) -> &EndToEndConfig {
         self.network.config()
     }
 
-    /// Uses another search; a directly regressed pose needs none.
+    /// Sets another search; a directly regressed pose needs none.
     pub fn set_solver(&mut self, solver: PoseSolver) {
         self.solver = solver;
     }
@@ -104,7 +104,7 @@ impl EndToEndLocalizer {
         })?;
         times.regress = start.elapsed();
         Ok(match upright(&answer, self.config().origin_m) {
-            Some(pose) => Localization::told(PoseEstimate::new(pose.into(), UNQUESTIONED), times),
+            Some(pose) => Localization::told(PoseEstimate::new(pose.into(), FULL_CONFIDENCE), times),
             None => no_pose(NoPoseReason::Failed, times),
         })
     }
@@ -135,11 +135,11 @@ fn no_pose(reason: NoPoseReason, times: LocalizerTimes) -> Localization {
     Localization::told(PoseEstimate::NoPose { reason, inlier_count: 0 }, times)
 }
 
-/// Position relative to the origin, cosine and sine of the heading; nothing when that is no pose.
+/// Position relative to the origin, cosine and sine of the heading; `None` if that is no pose.
 fn upright(answer: &[f32], origin_m: [f64; 3]) -> Option<Isometry3<f64>> {
     let &[x, y, z, cosine, sine] = answer else { return None };
     let [x, y, z, cosine, sine] = [x, y, z, cosine, sine].map(f64::from);
-    // Cosine and sine have length 1, unless the network said nothing about the heading.
+    // Cosine and sine have length 1, unless the network gives no heading.
     let is_pose = [x, y, z].iter().all(|axis| axis.is_finite()) && cosine.hypot(sine) > 0.5;
     is_pose.then(|| {
         let position = Vector3::new(x, y, z) + Vector3::from(origin_m);
@@ -168,7 +168,7 @@ mod tests {
         EndToEndConfig { regresses, town: "test".into(), origin_m: [1000.0, -2000.0, 30.0], encoder }
     }
 
-    /// Writes a network whose last layer answers `bias`, whatever it sees.
+    /// Writes a network whose last layer outputs `bias` for any sweep.
     fn write(folder: &Path, stated: &EndToEndConfig, built: &EndToEndConfig, bias: &[f32]) -> PathBuf {
         tch::set_num_threads(1);
         let variables = VarStore::new(Device::Cpu);
@@ -199,7 +199,7 @@ mod tests {
     }
 
     #[test]
-    fn a_regressed_pose_is_told_in_the_world_and_never_doubted() {
+    fn a_regressed_pose_is_in_the_world_frame_with_full_confidence() {
         let mut localizer = answering(EndToEndKind::Pose, &[0.5, -0.25, 0.01, 0.0, 3.0]);
         let answer = localizer.localize(&sweep()).unwrap();
         let pose = answer.estimate.world_from_cav().unwrap();
@@ -211,9 +211,9 @@ mod tests {
     }
 
     #[test]
-    fn an_answer_that_is_no_pose_is_refused() {
+    fn an_output_that_is_no_pose_is_rejected() {
         let failed = PoseEstimate::NoPose { reason: NoPoseReason::Failed, inlier_count: 0 };
-        // The first overflows when it becomes metres; the second leaves the heading open.
+        // The first overflows when it becomes metres; the second leaves the heading undefined.
         for bias in [[3e38, 0.0, 0.0, 1.0, 0.0], [0.0; 5]] {
             assert_eq!(answering(EndToEndKind::Pose, &bias).localize(&sweep()).unwrap().estimate, failed);
         }
@@ -223,7 +223,7 @@ mod tests {
                 pose @ PoseEstimate::Pose { .. } => panic!("{pose:?}"),
             };
         assert_eq!(reason(&[3e38, 0.0, 0.0]), NoPoseReason::TooFewPoints);
-        assert_eq!(reason(&[0.1, 0.2, 0.3]), NoPoseReason::TooFewInliers, "all cells at one place");
+        assert_eq!(reason(&[0.1, 0.2, 0.3]), NoPoseReason::TooFewInliers, "all cells at one position");
     }
 
     #[test]
@@ -245,19 +245,19 @@ mod tests {
     fn files_of_something_else_are_named() {
         let folder = tempfile::tempdir().unwrap();
         let (pose, cells) = (config(EndToEndKind::Pose), config(EndToEndKind::SceneCoordinates));
-        let complaint = |path: &Path| EndToEndLocalizer::load(path, Device::Cpu).unwrap_err().to_string();
+        let error_text = |path: &Path| EndToEndLocalizer::load(path, Device::Cpu).unwrap_err().to_string();
         let path = write(folder.path(), &pose, &cells, &[0.0; 3]);
-        let message = complaint(&path);
+        let message = error_text(&path);
         assert!(message.contains("weights.safetensors: tensor \"regressor."), "{message}");
         let wide = SceneEncoderConfig { voxel_m: -1.0, ..pose.encoder.clone() };
         let path = write(folder.path(), &EndToEndConfig { encoder: wide, ..pose.clone() }, &pose, &[0.0; 5]);
-        assert!(complaint(&path).contains("voxel_m is -1"), "{}", complaint(&path));
+        assert!(error_text(&path).contains("voxel_m is -1"), "{}", error_text(&path));
         let path = write(folder.path(), &pose, &pose, &[0.0; 5]);
         let message = Localizer::load(&path, &path, Device::Cpu).unwrap_err().to_string();
         assert!(message.contains("\"end to end\"") && message.contains("\"scene encoder\""), "{message}");
         let bytes = std::fs::read(&path).unwrap();
         std::fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();
-        assert!(complaint(&path).contains("not a whole safetensors file"), "{}", complaint(&path));
-        assert!(complaint(&folder.path().join("missing")).contains("missing"));
+        assert!(error_text(&path).contains("not a complete safetensors file"), "{}", error_text(&path));
+        assert!(error_text(&folder.path().join("missing")).contains("missing"));
     }
 }

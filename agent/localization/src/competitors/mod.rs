@@ -1,4 +1,4 @@
-//! Localizers that the paper compares PGC with: networks trained end to end.
+//! Competitors of PGC in the paper: networks trained end to end.
 
 mod end_to_end;
 mod end_to_end_localizer;

@@ -1,4 +1,4 @@
-//! A layer without structure.
+//! Dense layer: a linear map of features.
 
 use tch::nn::{self, Init};
 use tch::{TchError, Tensor};

@@ -1,23 +1,24 @@
-//! What a scene encoder is built from.
+//! Configuration of a scene encoder.
 
 use serde::{Deserialize, Serialize};
 
 use super::head_config::MAX_PARAMETERS;
 use perception::sparse::KERNEL_VOLUME;
 
-/// Residual groups, and windows around a cell, at most.
+/// Largest number of residual groups, and of windows around a cell.
 const MAX_ENTRIES: usize = 16;
-/// Cells of the last level from the sensor to the edge: planes of features have four times its square.
+/// Largest number of cells of the last level from the sensor to the edge: planes of features have four times its
+/// square.
 const MAX_PLANE_CELLS: f64 = 512.0;
 
-/// What a voxel is described by.
+/// Input features of a voxel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum VoxelInput {
     /// Mean of its points in the sensor frame, in units of 10 m: LightLoc's input.
     Coordinates,
-    /// Mean of its points relative to its middle in voxels, height above the sensor in units of 10 m, and 1: the same
-    /// wherever the sensor stands.
+    /// Mean of its points relative to its centre in voxels, height above the sensor in units of 10 m, and 1:
+    /// independent of the position of the sensor.
     Offsets,
 }
 
@@ -32,11 +33,11 @@ impl VoxelInput {
     }
 }
 
-/// A scene encoder.
+/// Configuration of a scene encoder.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SceneEncoderConfig {
-    /// Name, for model cards and messages.
+    /// Name, in model cards and messages.
     pub name: String,
     /// Edge of a voxel, metres.
     pub voxel_m: f64,
@@ -44,13 +45,14 @@ pub struct SceneEncoderConfig {
     pub range_m: f64,
     /// Lowest and highest point, metres in the sensor frame.
     pub height_m: [f64; 2],
-    /// What a voxel is described by.
+    /// Input features of a voxel.
     pub input: VoxelInput,
     /// Channels of the convolutions: the first at stride 1, every other at stride 2.
     pub widths: Vec<i64>,
     /// Channels of the residual groups on the last level.
     pub residual_widths: Vec<i64>,
-    /// Whether the level before the last has a residual group of its own, and cells are its sites, described by both.
+    /// True if the level before the last has a residual group of its own, and its sites are the cells, with features of
+    /// both.
     pub fine_cells: bool,
     /// Edges of the square windows whose mean feature describes a cell's surroundings, metres.
     pub context_m: Vec<f64>,
@@ -147,7 +149,7 @@ impl SceneEncoderConfig {
     /// Checks that a network can be built.
     ///
     /// # Errors
-    /// Says which field is wrong and what stood there.
+    /// Field and value that are wrong.
     pub fn validate(&self) -> Result<(), String> {
         let positive = |name: &str, value: f64| {
             (value.is_finite() && value > 0.0)
@@ -174,7 +176,7 @@ impl SceneEncoderConfig {
             None if self.range_m / self.voxel_m > 10_000.0 || self.range_m / self.coarse_cell_m() > MAX_PLANE_CELLS => {
                 Err(format!("range_m is {} with voxel_m {}: too many voxels", self.range_m, self.voxel_m))
             }
-            // Checked before anything of this size is allocated: the file that the numbers come from may be anybody's.
+            // Checked before anything of this size is allocated: the file with these numbers may come from anyone.
             None if self.parameters() > MAX_PARAMETERS => Err(format!(
                 "widths are {:?} and residual_widths {:?}: {} parameters, must be {MAX_PARAMETERS} at most",
                 self.widths,
@@ -206,7 +208,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn presets_are_what_their_names_say() {
+    fn presets_match_their_names() {
         let full = SceneEncoderConfig::full(1.0);
         assert_eq!((full.cell_m(), full.cell_channels(), full.sweep_channels()), (2.0, 512, 1024));
         let lean = SceneEncoderConfig::lean();
@@ -217,7 +219,7 @@ mod tests {
     }
 
     #[test]
-    fn absurd_configurations_are_refused_by_name() {
+    fn absurd_configurations_are_rejected_by_name() {
         let refused = |config: SceneEncoderConfig, field: &str| config.validate().unwrap_err().contains(field);
         assert!(refused(SceneEncoderConfig { voxel_m: 0.0, ..SceneEncoderConfig::lean() }, "voxel_m"));
         assert!(refused(SceneEncoderConfig { voxel_m: 1e-6, ..SceneEncoderConfig::lean() }, "too many"));

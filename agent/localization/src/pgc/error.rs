@@ -1,40 +1,40 @@
-//! What can go wrong in a localizer.
+//! Errors of a localizer.
 
 use tch::TchError;
 
 use perception::torch_error::first_line;
 use perception::weights::WeightsError;
 
-/// Why a localizer cannot be made or a sweep not be localised by it.
+/// Error of loading a localizer or of localizing a sweep.
 #[derive(Debug, thiserror::Error)]
 pub enum LocalizerError {
-    /// The weights are not readable or made for something else.
+    /// The weights are not readable or made for another model.
     #[error(transparent)]
     Weights(#[from] WeightsError),
-    /// The configuration is not one of a network.
+    /// The configuration does not describe a network.
     #[error("localizer: {0}")]
     Config(String),
-    /// The confidence in a head's file is none that can be computed with.
+    /// The confidence model in a head's file is not valid.
     #[error("{head}: confidence: {reason}")]
     Confidence {
-        /// File of the head.
+        /// Path of the head.
         head: String,
-        /// What is wrong with it.
+        /// Field and value that are wrong.
         reason: String,
     },
     /// The head was trained on the features of another encoder.
     #[error("{head}: trained on encoder {expected}, but {encoder} is {found} (SHA-256)")]
     OtherEncoder {
-        /// File of the head.
+        /// Path of the head.
         head: String,
-        /// Hash of the encoder that the head was trained with.
+        /// SHA-256 of the encoder that the head was trained with.
         expected: String,
-        /// File of the encoder.
+        /// Path of the encoder.
         encoder: String,
-        /// Its hash.
+        /// SHA-256 of this encoder.
         found: String,
     },
-    /// The tensor library refused.
+    /// The tensor library failed.
     #[error("tensor library: {}", first_line(.0))]
     Tensor(#[from] TchError),
 }

@@ -1,12 +1,12 @@
-//! Features at mean 0 and deviation 1.
+//! Normalisation of features to mean 0 and deviation 1.
 
 use tch::nn;
 use tch::{Kind, TchError, Tensor, no_grad};
 
-/// What is constant counts as if it had this deviation.
+/// Smallest deviation: constant channels are scaled as if they had this one.
 const LEAST_DEVIATION: f64 = 1e-4;
 
-/// Brings features to mean 0 and deviation 1, each channel for itself; what it knows is computed, not learnt.
+/// Normalises features to mean 0 and deviation 1 per channel; its statistics are computed, not learnt.
 #[derive(Debug)]
 pub(crate) struct FeatureNorm {
     mean: Tensor,
@@ -14,12 +14,12 @@ pub(crate) struct FeatureNorm {
 }
 
 impl FeatureNorm {
-    /// One that changes nothing yet.
+    /// Identity until [`Self::fit`].
     pub(crate) fn new(path: &nn::Path<'_>, channels: i64) -> Self {
         Self { mean: path.zeros_no_train("mean", &[channels]), scale: path.ones_no_train("scale", &[channels]) }
     }
 
-    /// Takes mean and deviation of `[N, channels]`.
+    /// Sets mean and deviation of `[N, channels]`.
     pub(crate) fn fit(&mut self, features: &Tensor) -> Result<(), TchError> {
         let features = features.f_to_kind(Kind::Float)?;
         let deviation = features.f_std_dim(0_i64, false, false)?;

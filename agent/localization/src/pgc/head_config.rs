@@ -1,19 +1,19 @@
-//! What a scene head is built from.
+//! Configuration of a scene head.
 
 use serde::{Deserialize, Serialize};
 
-/// Values of a lattice.
-const MAX_LATTICE: i64 = 64_000_000;
-/// Cells around a cell that a refiner looks at, along each direction, at most.
+/// Largest number of values of a key grid.
+const MAX_KEY_GRID: i64 = 64_000_000;
+/// Largest reach of a refiner around a cell along each direction, corners.
 const MAX_REACH: i64 = 16;
-/// Parameters of a network, head or encoder: keeps a wrong number from taking all memory.
+/// Largest number of parameters of a network, head or encoder: bounds the memory that a wrong number can take.
 pub(super) const MAX_PARAMETERS: i64 = 256_000_000;
 
-/// The head of one town.
+/// Configuration of the head of one scene.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SceneHeadConfig {
-    /// Name of the town, for model cards and messages.
+    /// Name of the scene, in model cards and messages.
     pub town: String,
     /// SHA-256 of the encoder file whose features it was trained on.
     pub encoder_sha256: String,
@@ -23,42 +23,42 @@ pub struct SceneHeadConfig {
     pub sweep_channels: i64,
     /// Clusters of sensor positions that sweeps are classified into.
     pub classes: i64,
-    /// Clusters of world coordinates that a cell is placed among.
+    /// Clusters of world coordinates, the reference points of a cell's offset.
     pub centres: i64,
-    /// Channels inside.
+    /// Hidden channels.
     pub width: i64,
     /// Residual blocks of three layers.
     pub blocks: usize,
-    /// Middle of the training positions, metres in the world: coordinates are relative to it.
+    /// Centre of the training positions, metres in the world: coordinates are relative to it.
     pub origin_m: [f64; 3],
-    /// Cells of a sweep that are regressed at most.
+    /// Largest number of cells of a sweep that are regressed.
     pub max_cells: usize,
-    /// The second look; nothing: there is none.
+    /// Pose refinement; `None` for none.
     pub refiner: Option<RefinerConfig>,
 }
 
-/// The refiner of a head.
+/// Configuration of the refiner of a head.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RefinerConfig {
-    /// Channels of a cell that it looks at: those before the surroundings.
+    /// Channels of a cell that enter the refiner: those before the surroundings.
     pub local_channels: i64,
-    /// South-west corner of the town, metres relative to the head's origin.
+    /// South-west corner of the scene, metres relative to the head's origin.
     pub low_m: [f64; 2],
-    /// North-east corner.
+    /// North-east corner of the scene, metres relative to the head's origin.
     pub high_m: [f64; 2],
-    /// Distance between corners of the lattice, metres.
+    /// Distance between corners of the key grid, metres.
     pub spacing_m: f64,
-    /// Corners to each side that are candidates.
+    /// Number of candidate corners to each side.
     pub reach: i64,
     /// Channels of a key.
     pub keys: i64,
-    /// Channels inside.
+    /// Hidden channels.
     pub width: i64,
 }
 
 impl RefinerConfig {
-    /// Corners along x and y.
+    /// Number of corners along x and y.
     #[must_use]
     pub fn corners(&self) -> [i64; 2] {
         std::array::from_fn(|axis| {
@@ -67,7 +67,7 @@ impl RefinerConfig {
         })
     }
 
-    /// The part of the lattice between two corners (metres relative to the origin), and the rows of the whole lattice that
+    /// The part of the key grid between two corners (metres relative to the origin), and the rows of the full grid that
     /// its rows are.
     #[must_use]
     pub fn cropped(&self, low_m: [f64; 2], high_m: [f64; 2]) -> (Self, Vec<i64>) {
@@ -93,13 +93,13 @@ impl RefinerConfig {
     /// Checks that a network can be built.
     ///
     /// # Errors
-    /// Says which field is wrong and what stood there.
+    /// Field and value that are wrong.
     pub fn validate(&self) -> Result<(), String> {
         let sizes = [("local_channels", self.local_channels), ("keys", self.keys), ("width", self.width)];
         if let Some((name, size)) = sizes.into_iter().find(|(_, size)| !(1..=4096).contains(size)) {
             return Err(format!("refiner: {name} is {size}, must be 1 to 4096"));
         }
-        // What is looked at around every cell grows with its square.
+        // The size of the neighbourhood of every cell grows with its square.
         if !(1..=MAX_REACH).contains(&self.reach) {
             return Err(format!("refiner: reach is {}, must be 1 to {MAX_REACH}", self.reach));
         }
@@ -111,10 +111,10 @@ impl RefinerConfig {
             return Err(format!("refiner: spacing_m is {}, must be 0.1 to 100", self.spacing_m));
         }
         let [columns, rows] = self.corners();
-        // Checked before anything of this size is allocated: the file that the numbers come from may be anybody's.
+        // Checked before anything of this size is allocated: the file with these numbers may come from anyone.
         match columns.saturating_mul(rows).saturating_mul(self.keys) {
-            values if values > MAX_LATTICE => Err(format!(
-                "refiner: {columns} x {rows} corners of {} keys are {values} values, must be {MAX_LATTICE} at most",
+            values if values > MAX_KEY_GRID => Err(format!(
+                "refiner: {columns} x {rows} corners of {} keys are {values} values, must be {MAX_KEY_GRID} at most",
                 self.keys
             )),
             _ => Ok(()),
@@ -126,7 +126,7 @@ impl SceneHeadConfig {
     /// Checks that a network can be built.
     ///
     /// # Errors
-    /// Says which field is wrong and what stood there.
+    /// Field and value that are wrong.
     pub fn validate(&self) -> Result<(), String> {
         let sizes = [
             ("cell_channels", self.cell_channels),
@@ -152,7 +152,7 @@ impl SceneHeadConfig {
         }
     }
 
-    /// Parameters of the layers that regress; those of the classifier are few in any case.
+    /// Parameters of the regressing layers; those of the classifier are few in any case.
     fn parameters(&self) -> i64 {
         let blocks = self.blocks as i64 * 3 * self.width;
         (self.cell_channels + self.classes + blocks + self.centres + 4) * self.width
@@ -164,7 +164,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_lattice_too_large_for_memory_is_refused_with_its_size() {
+    fn a_key_grid_too_large_for_memory_is_rejected_with_its_size() {
         let huge = RefinerConfig {
             local_channels: 4,
             low_m: [0.0; 2],
@@ -181,7 +181,7 @@ mod tests {
     }
 
     #[test]
-    fn a_head_too_large_for_memory_is_refused_with_its_size() {
+    fn a_head_too_large_for_memory_is_rejected_with_its_size() {
         let head = SceneHeadConfig {
             town: "test".into(),
             encoder_sha256: String::new(),
@@ -201,7 +201,7 @@ mod tests {
     }
 
     #[test]
-    fn a_cropped_lattice_has_its_corners_where_they_were() {
+    fn a_cropped_key_grid_keeps_the_positions_of_its_corners() {
         let whole = RefinerConfig {
             local_channels: 4,
             low_m: [-50.0, -40.0],

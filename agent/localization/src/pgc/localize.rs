@@ -1,4 +1,4 @@
-//! The live pipeline: a sweep in, a pose with its confidence out.
+//! Live localization pipeline: from a sweep to a pose with its confidence.
 
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -21,19 +21,20 @@ use super::voxelise::{Cell, SweepVoxels};
 use crate::registration::Correspondence;
 use perception::weights::Weights;
 
-/// Cells that are regressed at most, where the head allows for more: poses hardly gain from more, and they take time.
+/// Largest number of regressed cells, where the head allows for more: more cells hardly improve poses, and they take
+/// time.
 pub(crate) const CELLS: usize = 256;
-/// Cells of the second look at most: it costs little for each of them, and what they err by averages out.
-const SECOND_CELLS: usize = 768;
-/// Share of the regressed cells that may be flat ground, which looks the same everywhere.
+/// Largest number of cells of the pose refinement: each costs little, and their errors average out.
+const REFINEMENT_CELLS: usize = 768;
+/// Largest share of the regressed cells that may be flat ground, which looks the same everywhere.
 const FLAT_SHARE: f64 = 0.25;
 
-/// Where each cell of a sweep lies in the world, as far as the network knows.
+/// Predicted world coordinates of the cells of a sweep.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct SceneCoordinates {
-    /// `[N]`: in the sensor frame, metres.
+    /// `[N, 3]`: in the sensor frame, metres.
     pub sensor_m: Vec<[f32; 3]>,
-    /// `[N]`: in the world relative to the head's origin, metres.
+    /// `[N, 3]`: in the world relative to the head's origin, metres.
     pub world_m: Vec<[f32; 3]>,
     /// `[N]`: predicted L1 error, metres.
     pub epsilon_m: Vec<f32>,
@@ -41,53 +42,53 @@ pub struct SceneCoordinates {
     pub origin_m: [f64; 3],
 }
 
-/// Scene coordinates, and the cells that the second look asks for: more of the same sweep.
+/// Scene coordinates, and the cells of the pose refinement: more of the same sweep.
 struct Regressed {
     coordinates: SceneCoordinates,
-    again: SweepCells,
+    refinement_cells: SweepCells,
 }
 
 /// Time per stage.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct LocalizerTimes {
-    /// Points into voxels and rulebooks.
+    /// Voxels and rulebooks from points.
     pub voxelise: Duration,
-    /// The encoder.
+    /// Scene encoder.
     pub encode: Duration,
-    /// The head.
+    /// Scene head.
     pub regress: Duration,
-    /// The pose solver.
+    /// Pose solver.
     pub solve: Duration,
-    /// The second look, its fits included.
+    /// Pose refinement, its fits included.
     pub refine: Duration,
 }
 
-/// What came of one sweep.
+/// Result of one sweep.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Localization {
-    /// `world_from_lidar` with its confidence, or why there is none.
+    /// `world_from_lidar` with its confidence, or the reason why there is none.
     pub estimate: PoseEstimate,
-    /// The pose with what speaks for it, also where `estimate` withholds it.
+    /// The pose with its evidence, also if `estimate` rejects it.
     pub found: Option<FoundPose>,
-    /// Cells that agree on the pose.
+    /// Number of inliers.
     pub inlier_count: u32,
-    /// Their share of all regressed cells.
+    /// Inliers as a share of all regressed cells, 0..=1.
     pub inlier_ratio: f64,
-    /// Where the time went.
+    /// Time per stage.
     pub times: LocalizerTimes,
 }
 
-/// Says where a sweep was made.
+/// Estimates the pose of a sweep.
 pub trait Localize: std::fmt::Debug + Send {
-    /// Localises one sweep.
+    /// Localizes one sweep.
     ///
     /// # Errors
-    /// [`LocalizerError::Tensor`] when the tensor library refuses. A sweep that cannot be localised is no error but an
-    /// answer: [`PoseEstimate::NoPose`].
+    /// [`LocalizerError::Tensor`] when the tensor library fails. A sweep that cannot be localized is no error but a
+    /// result: [`PoseEstimate::NoPose`].
     fn localize(&mut self, cloud: &PointCloud) -> Result<Localization, LocalizerError>;
 }
 
-/// Encoder, head of a town and solver.
+/// Encoder, scene-specific head and solver.
 #[derive(Debug)]
 pub struct Localizer {
     encoder: SceneEncoder,
@@ -101,15 +102,16 @@ impl Localizer {
     /// Reads encoder and head.
     ///
     /// # Errors
-    /// [`LocalizerError`] when a file is missing, cut off, of something else, when its confidence is none, or when the head
-    /// was trained on the features of another encoder.
+    /// [`LocalizerError`] when a file is missing, truncated or of another kind, when its confidence model is not valid,
+    /// or when the head was trained on the features of another encoder.
     pub fn load(encoder: &Path, head: &Path, device: Device) -> Result<Self, LocalizerError> {
         let (mut localizer, weights) = Self::open(encoder, head, device)?;
         localizer.solver.confidence = stored_confidence(&weights)?;
         Ok(localizer)
     }
 
-    /// The same without the confidence in the head's file, to fit one anew: one of an earlier version has other features.
+    /// The same without the confidence model in the head's file, to fit a new one: one of an earlier version has other
+    /// features.
     ///
     /// # Errors
     /// As [`Self::load`].
@@ -138,13 +140,13 @@ impl Localizer {
         Ok((Self { encoder: network, head: scene_head, solver: PoseSolver::default(), device, sha256 }, weights))
     }
 
-    /// Hashes of encoder and head.
+    /// SHA-256 of encoder and head.
     #[must_use]
     pub fn sha256(&self) -> &[String; 2] {
         &self.sha256
     }
 
-    /// The head's configuration: town, origin.
+    /// The head's configuration: scene, origin.
     #[must_use]
     pub fn head_config(&self) -> &SceneHeadConfig {
         self.head.config()
@@ -153,14 +155,14 @@ impl Localizer {
     /// First steps: voxels, features, scene coordinates.
     ///
     /// # Errors
-    /// [`LocalizerError::Tensor`] when the tensor library refuses.
+    /// [`LocalizerError::Tensor`] when the tensor library fails.
     pub fn scene_coordinates(&self, cloud: &PointCloud) -> Result<(SceneCoordinates, LocalizerTimes), LocalizerError> {
         let mut times = LocalizerTimes::default();
         let regressed = self.regress(cloud, &mut times)?;
         Ok((regressed.map(|regressed| regressed.coordinates).unwrap_or_default(), times))
     }
 
-    /// Nothing for a sweep without cells.
+    /// `None` for a sweep without cells.
     fn regress(&self, cloud: &PointCloud, times: &mut LocalizerTimes) -> Result<Option<Regressed>, LocalizerError> {
         let start = Instant::now();
         let points = cloud.xyzi.iter().map(|&[x, y, z, _]| [x, y, z]);
@@ -177,7 +179,7 @@ impl Localizer {
 
         let start = Instant::now();
         let SweepCells { features: cells, sensor_m } = self.pick(&sweep, &features, &chosen)?;
-        let again = self.pick(&sweep, &features, &choose_evenly(sweep.cells(), SECOND_CELLS))?;
+        let refinement_cells = self.pick(&sweep, &features, &choose_evenly(sweep.cells(), REFINEMENT_CELLS))?;
         let (world, epsilon_m) = no_grad(|| -> Result<(Vec<f32>, Vec<f32>), TchError> {
             let logits = self.head.classify(&features.sweeps, false)?.f_expand([chosen.len() as i64, -1], false)?;
             let regression = self.head.regress(&self.head.normalise(&cells)?, &logits, Kind::Float)?;
@@ -187,7 +189,7 @@ impl Localizer {
         times.regress = start.elapsed();
         let origin_m = self.head.config().origin_m;
         let coordinates = SceneCoordinates { sensor_m, world_m: world.as_chunks().0.to_vec(), epsilon_m, origin_m };
-        Ok(Some(Regressed { coordinates, again }))
+        Ok(Some(Regressed { coordinates, refinement_cells }))
     }
 
     fn pick(&self, sweep: &SweepVoxels, features: &SceneFeatures, chosen: &[usize]) -> Result<SweepCells, TchError> {
@@ -203,7 +205,7 @@ impl Localizer {
         &self.solver
     }
 
-    /// Uses another search or confidence.
+    /// Sets another search or confidence.
     pub fn set_solver(&mut self, solver: PoseSolver) {
         self.solver = solver;
     }
@@ -211,17 +213,17 @@ impl Localizer {
     /// All steps.
     ///
     /// # Errors
-    /// [`LocalizerError::Tensor`] when the tensor library refuses. A sweep that cannot be localised is no error but an
-    /// answer: [`PoseEstimate::NoPose`].
+    /// [`LocalizerError::Tensor`] when the tensor library fails. A sweep that cannot be localized is no error but a
+    /// result: [`PoseEstimate::NoPose`].
     pub fn localize(&self, cloud: &PointCloud) -> Result<Localization, LocalizerError> {
         let mut times = LocalizerTimes::default();
-        let Regressed { coordinates, again } = match self.regress(cloud, &mut times)? {
+        let Regressed { coordinates, refinement_cells } = match self.regress(cloud, &mut times)? {
             Some(regressed) => regressed,
             None => return Ok(Localization::new(&self.solver.solve(&SceneCoordinates::default()), times)),
         };
         let search = PoseSearch { head: &self.head, solver: &self.solver, kind: Kind::Float };
         let mut spent = SearchTimes::default();
-        let solved = search.run(&coordinates, &again, &mut spent)?;
+        let solved = search.run(&coordinates, &refinement_cells, &mut spent)?;
         Ok(Localization::new(&solved, LocalizerTimes { solve: spent.solve, refine: spent.refine, ..times }))
     }
 }
@@ -233,7 +235,7 @@ impl Localize for Localizer {
 }
 
 impl Localization {
-    /// The answer that a solver found.
+    /// Result of a solver.
     #[must_use]
     pub fn new(solved: &Solved, times: LocalizerTimes) -> Self {
         let found = solved.as_ref().ok().copied();
@@ -252,7 +254,7 @@ impl Localization {
 }
 
 impl Localization {
-    /// The answer of something that does not look at cells one by one: nothing speaks for a pose but the answer itself.
+    /// Result of a method without cells: its estimate is the only evidence.
     #[must_use]
     pub fn told(estimate: PoseEstimate, times: LocalizerTimes) -> Self {
         let (found, inlier_count) = match estimate {
@@ -268,7 +270,7 @@ impl Localization {
 }
 
 impl LocalizerTimes {
-    /// The stages by name, in the order they run.
+    /// Stages by name, in their order.
     #[must_use]
     pub fn stages(&self) -> Vec<StageTiming> {
         let Self { voxelise, encode, regress, solve, refine } = *self;
@@ -283,7 +285,7 @@ impl LocalizerTimes {
         .into()
     }
 
-    /// All stages together.
+    /// Sum of all stages.
     #[must_use]
     pub fn total(&self) -> Duration {
         self.voxelise + self.encode + self.regress + self.solve + self.refine
@@ -291,7 +293,7 @@ impl LocalizerTimes {
 }
 
 impl SceneCoordinates {
-    /// For the solver, weighted by Eq. 6.
+    /// Correspondences for the solver, weighted by Eq. 6.
     #[must_use]
     pub fn correspondences(&self) -> Vec<Correspondence> {
         let places = self.sensor_m.iter().zip(&self.world_m).zip(&self.epsilon_m);
@@ -301,7 +303,7 @@ impl SceneCoordinates {
     }
 }
 
-/// The confidence in a head's file; the plain one where there is none.
+/// The confidence model in a head's file; the plain confidence if there is none.
 fn stored_confidence(weights: &Weights) -> Result<Confidence, LocalizerError> {
     if weights.metadata(CONFIDENCE_KEY).is_none() {
         return Ok(Confidence::Plain);
@@ -322,7 +324,7 @@ pub fn sigma(epsilon_m: f32) -> f32 {
 pub(crate) fn choose_evenly(cells: &[Cell], count: usize) -> Vec<usize> {
     let (flat, high): (Vec<usize>, Vec<usize>) = (0..cells.len()).partition(|&cell| cells[cell].is_flat());
     let mut chosen = every_nth(&high, (count as f64 * (1.0 - FLAT_SHARE)) as usize);
-    // A share of what is chosen: a sweep with little but ground must not be placed by its ground.
+    // A share of the chosen cells: a sweep with little but ground must not be localized by its ground.
     let flat_count = chosen.len() as f64 * FLAT_SHARE / (1.0 - FLAT_SHARE);
     chosen.extend(every_nth(&flat, flat_count as usize));
     chosen
@@ -341,7 +343,7 @@ mod tests {
     use perception::weights::{self, Precision};
 
     #[test]
-    fn a_confidence_that_would_fail_on_a_sweep_is_refused_with_its_file() {
+    fn a_confidence_that_would_fail_on_a_sweep_is_rejected_with_its_file() {
         let folder = tempfile::tempdir().unwrap();
         let stored = |model: &ConfidenceModel| {
             let path = folder.path().join("head.safetensors");

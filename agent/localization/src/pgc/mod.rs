@@ -1,7 +1,7 @@
-//! Where am I: scene-coordinate regression from one sweep (the paper's PGC, after LightLoc).
+//! Scene-coordinate regression: pose and confidence from one sweep (the paper's PGC, after LightLoc).
 //!
-//! A sparse encoder describes cells of the sweep; a head that belongs to one town says for each cell where in the world
-//! it lies and how far off that may be; a robust solver turns these correspondences into a pose.
+//! A sparse encoder describes the cells of the sweep; a scene-specific head predicts the world coordinates of each cell
+//! and their error; a robust solver turns these correspondences into a pose.
 
 pub mod confidence;
 pub(crate) mod dense;

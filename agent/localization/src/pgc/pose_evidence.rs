@@ -1,4 +1,4 @@
-//! What speaks for a pose that was found.
+//! Evidence for a pose: statistics of the cells that it was estimated from.
 
 use serde::{Deserialize, Serialize};
 
@@ -7,14 +7,14 @@ use super::pose_refinement::RefinedPose;
 use super::pose_std::PoseStd;
 use crate::registration::Registration;
 
-/// Facts about the cells that a pose was found from.
+/// Statistics of the cells that a pose was estimated from.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct PoseEvidence {
-    /// Cells of the sweep.
+    /// Number of cells of the sweep.
     pub cells: usize,
-    /// Cells that agree with the pose.
+    /// Number of inliers.
     pub inliers: usize,
-    /// Share of them.
+    /// Inliers as a share of all cells, 0..=1.
     pub inlier_ratio: f64,
     /// Root mean square of the inliers' residuals, metres.
     pub rms_m: f64,
@@ -24,38 +24,38 @@ pub struct PoseEvidence {
     pub median_epsilon_m: f64,
     /// Mean of the inliers' confidences (Eq. 6), 0..=1.
     pub inlier_sigma: f64,
-    /// Standard deviation of the position that the cells' residuals and places leave, metres.
+    /// Standard deviation of the position, from residuals and positions of the cells, metres.
     pub position_std_m: f64,
-    /// The same of the orientation, radians.
+    /// Standard deviation of the orientation, radians.
     pub rotation_std_rad: f64,
-    /// What a second look had to say, where there was one.
+    /// Evidence of the pose refinement, if there was one.
     pub second: Option<RefinementEvidence>,
 }
 
-/// Facts about the cells when they were looked at again, with the pose known roughly.
+/// Statistics of the cells in the pose refinement, which starts from a coarse pose.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct RefinementEvidence {
-    /// Share of the cells that agree with the sharpened pose.
+    /// Inliers of the refined pose as a share of the cells, 0..=1.
     pub inlier_ratio: f64,
     /// Root mean square of their residuals, metres.
     pub rms_m: f64,
     /// Median of all cells' predicted errors, metres.
     pub median_epsilon_m: f64,
-    /// Mean of the agreeing cells' confidences (Eq. 6), 0..=1.
+    /// Mean of the inliers' confidences (Eq. 6), 0..=1.
     pub inlier_sigma: f64,
-    /// How far the second look moved the pose, metres.
+    /// Distance between coarse and refined position, metres.
     pub moved_m: f64,
-    /// A quarter of all cells answer nearer than this to where the pose puts them, metres.
+    /// Lower quartile of the distances between predicted cells and their positions under the pose, metres.
     pub residual_quartile_m: f64,
-    /// Sum of the last fit's weights, the inverse squares of the cells' predicted errors as far as the fit listened to them,
-    /// 1 / square metres.
+    /// Sum of the last fit's weights, 1 / square metres: the inverse squares of the cells' predicted errors, weighted
+    /// by the robust kernel.
     pub information_per_m2: f64,
-    /// Standard deviation of the position along the axis that is known worst, metres.
+    /// Standard deviation of the position along its worst axis, metres.
     pub worst_axis_std_m: f64,
 }
 
 impl PoseEvidence {
-    /// Looks at a registration of `coordinates` and at the second look that started from it.
+    /// Evidence of a registration of `coordinates` and of the pose refinement that started from it.
     #[must_use]
     pub(super) fn gather(
         coordinates: &SceneCoordinates,
@@ -77,7 +77,7 @@ impl PoseEvidence {
         }
     }
 
-    /// Of a pose that was not found from cells: nothing speaks for it but the answer itself.
+    /// Evidence of a pose that was not estimated from cells.
     #[must_use]
     pub(super) fn none() -> Self {
         Self {
@@ -94,8 +94,8 @@ impl PoseEvidence {
         }
     }
 
-    /// Confidence without any calibration: mean confidence of the inliers, as last known, times the share of cells that
-    /// agreed when nothing was known yet.
+    /// Confidence without calibration: mean confidence of the inliers, from the last stage, times the inlier ratio of
+    /// the first one.
     #[must_use]
     pub fn plain_sigma(&self) -> f64 {
         let inlier_sigma = self.second.map_or(self.inlier_sigma, |second| second.inlier_sigma);
@@ -126,14 +126,14 @@ fn mean_over(cells: &[u32], epsilon_m: &[f32], value: impl Fn(f32) -> f64) -> f6
     values.sum::<f64>() / cells.len().max(1) as f64
 }
 
-/// Upper median over all cells; 0 for none. Input of the fitted confidence model, which knows this rule.
+/// Upper median over all cells; 0 for none. The fitted confidence model depends on this rule.
 fn median(epsilon_m: &[f32]) -> f64 {
     let mut sorted = epsilon_m.to_vec();
     let middle = sorted.len() / 2;
     if sorted.is_empty() { 0.0 } else { f64::from(*sorted.select_nth_unstable_by(middle, f32::total_cmp).1) }
 }
 
-/// Spread of the pose of a first look: its inliers count by their confidences.
+/// Standard deviation of a coarse pose: its inliers are weighted by their confidences.
 fn first_std(coordinates: &SceneCoordinates, registration: &Registration) -> PoseStd {
     let pairs = coordinates.correspondences();
     let inliers = registration.inliers.iter().filter_map(|&cell| pairs.get(cell as usize));
@@ -146,8 +146,8 @@ mod tests {
     use crate::pgc::synthetic::SyntheticScene;
     use crate::registration::ransac::{RansacConfig, solve};
 
-    fn evidence(town: &SyntheticScene) -> PoseEvidence {
-        let coordinates = town.coordinates(1);
+    fn evidence(scene: &SyntheticScene) -> PoseEvidence {
+        let coordinates = scene.coordinates(1);
         let found = solve(&coordinates.correspondences(), &RansacConfig::default()).unwrap();
         PoseEvidence::gather(&coordinates, &found, None)
     }
@@ -165,7 +165,7 @@ mod tests {
     }
 
     #[test]
-    fn a_second_look_decides_the_confidence_of_cells_and_not_their_share() {
+    fn refinement_sets_the_confidence_of_cells_and_not_the_inlier_ratio() {
         let coordinates = SyntheticScene::default().coordinates(1);
         let pairs = coordinates.correspondences();
         let found = solve(&pairs, &RansacConfig::default()).unwrap();

@@ -1,4 +1,4 @@
-//! From a rough pose to a sharp one: the refiner's answers, fitted anew, twice.
+//! Pose refinement: from a coarse pose to an accurate one, by two rounds of the refiner's predictions and a new fit.
 
 use nalgebra::{Isometry3, Point3, Vector3};
 use tch::{Device, Kind, TchError, Tensor, no_grad};
@@ -10,45 +10,46 @@ use crate::registration::{Correspondence, Registration};
 
 /// Scales of the fits of each round, metres: the first pose may be off by two metres, the second hardly is.
 const ROUNDS_M: [&[f64]; 2] = [&[2.0, 1.2, 0.8], &[0.6, 0.4, 0.3, 0.3]];
-/// Scales of a round that goes before them where the first pose may be off by more, metres.
+/// Scales of an additional first round if the coarse pose may be off by more, metres.
 const WIDE_ROUND_M: &[f64] = &[4.0, 3.0, 2.0];
-/// A cell agrees with the sharp pose when its answer is this near, metres.
-const AGREES_M: f64 = 1.0;
-/// What even the best cell does not know, metres.
+/// Distance at which a cell is an inlier of the refined pose, metres.
+const INLIER_M: f64 = 1.0;
+/// Smallest error of a cell, metres.
 const FLOOR_M: f32 = 0.1;
 
-/// Cells of one sweep that the refiner is asked for.
+/// Cells of one sweep that enter the refiner.
 #[derive(Debug)]
 pub struct SweepCells {
     /// `[N, cell_channels]`.
     pub features: Tensor,
-    /// `[N]`: in the sensor frame, metres.
+    /// `[N, 3]`: in the sensor frame, metres.
     pub sensor_m: Vec<[f32; 3]>,
 }
 
-/// A sharpened pose and the answers that it rests on.
+/// A refined pose and the predictions that it was fitted to.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct RefinedPose {
-    /// `origin_from_sensor` and who agrees with it.
+    /// `origin_from_sensor` and its inliers.
     pub(super) registration: Registration,
-    /// `[N]`: predicted L1 error of each cell's last answer, metres.
+    /// `[N]`: predicted L1 error of each cell's last prediction, metres.
     pub(super) epsilon_m: Vec<f32>,
-    /// A quarter of the cells, all of them counted, answer nearer than this to where the pose puts them, metres.
+    /// Lower quartile of the distances between all predicted cells and their positions under the pose, metres.
     pub(super) residual_quartile_m: f64,
-    /// How far it may be off.
+    /// Standard deviations of the pose.
     pub(super) std: PoseStd,
-    /// Sum of the weights of the last fit, 1 / square metres: what the cells know of the place by their own account, as far
-    /// as the fit listened to them.
+    /// Sum of the weights of the last fit, 1 / square metres: per-cell predicted precision, weighted by the robust
+    /// kernel.
     pub(super) information_per_m2: f64,
 }
 
-/// Asks the refiner where cells are that `start` puts somewhere; poses are relative to the head's origin.
+/// Refines the pose `start`: the refiner predicts the positions of cells near those that `start` gives. Poses are
+/// relative to the head's origin.
 ///
-/// `is_wide` says that `start` may be off by more than usual. Nothing comes back where the head has no refiner or its
-/// answers fix no pose.
+/// With `is_wide` the error of `start` may be larger than usual. `None` if the head has no refiner or its predictions
+/// do not constrain a pose.
 ///
 /// # Errors
-/// The tensor library's.
+/// Those of the tensor library.
 pub(super) fn refine(
     head: &SceneHead,
     cells: &SweepCells,
@@ -92,31 +93,30 @@ pub(super) fn refine(
             Ok(fitted) => pose = fitted,
             Err(_) => return Ok(None),
         }
-        let scale_m = scales_m.last().copied().unwrap_or(AGREES_M);
+        let scale_m = scales_m.last().copied().unwrap_or(INLIER_M);
         let weigh = |pair: &Correspondence| f64::from(pair.weight) * forgiveness(pair.residual_m(&pose), scale_m);
         let weighted: Vec<_> = pairs.iter().filter(|pair| pair.usable()).map(|pair| (pair, weigh(pair))).collect();
         let information_per_m2 = weighted.iter().map(|(_, weight)| weight).sum();
         let std = PoseStd::of(&pose, weighted.into_iter());
-        let registration = Registration::judge(&pairs, pose, AGREES_M);
+        let registration = Registration::judge(&pairs, pose, INLIER_M);
         let residual_quartile_m = lower_quartile(pairs.iter().map(|pair| distance_m(pair, &pose)).collect());
         answer = Some(RefinedPose { registration, epsilon_m, residual_quartile_m, std, information_per_m2 });
     }
     Ok(answer)
 }
 
-/// How far an answer is from where a pose puts its cell, metres; infinite where it is no place.
+/// Distance between a predicted position and the one of its cell under a pose, metres; infinite if it is not finite.
 fn distance_m(pair: &Correspondence, pose: &Isometry3<f64>) -> f64 {
     if pair.usable() { pair.residual_m(pose) } else { f64::INFINITY }
 }
 
-/// A quarter of the values is below it; infinite where there are none. Input of the fitted confidence model, which knows
-/// this rule.
+/// Lower quartile of the values; infinite if there are none. The fitted confidence model depends on this rule.
 fn lower_quartile(mut values: Vec<f64>) -> f64 {
     let quarter = values.len() / 4;
     if values.is_empty() { f64::INFINITY } else { *values.select_nth_unstable_by(quarter, f64::total_cmp).1 }
 }
 
-/// Weight of an answer: the inverse of its expected squared error.
+/// Weight of a prediction: the inverse of its expected squared error.
 fn precision(epsilon_m: f32) -> f32 {
     1.0 / (FLOOR_M * FLOOR_M + epsilon_m * epsilon_m)
 }

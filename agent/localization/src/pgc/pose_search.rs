@@ -1,4 +1,4 @@
-//! From scene coordinates to a sharp pose: search, look again, and where few cells agree search once more, wider.
+//! Pose search: from scene coordinates to a refined pose, with wider searches if few cells are inliers.
 
 use std::time::{Duration, Instant};
 
@@ -10,84 +10,84 @@ use super::pose_solver::{FoundPose, PoseSolver, Solved};
 use super::scene_regression::SceneHead;
 use crate::registration::NoRegistration;
 
-/// How much farther off than usual cells may be in one search after the other.
+/// Factor on the expected error of cells in each search.
 const WIDENING: [f64; 3] = [1.0, 2.0, 4.0];
-/// Where so large a share of the cells agrees with a pose, nothing else is tried.
-const SURE: f64 = 0.5;
+/// Inlier ratio from which no further search is tried.
+const SUFFICIENT_RATIO: f64 = 0.5;
 
 /// Time of the two stages, over all attempts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct SearchTimes {
-    /// The searches.
+    /// Searches.
     pub solve: Duration,
-    /// The second looks, their fits included.
+    /// Pose refinements, their fits included.
     pub refine: Duration,
 }
 
-/// Finds the pose of one sweep.
+/// Estimates the pose of one sweep.
 #[derive(Debug, Clone, Copy)]
 pub struct PoseSearch<'a> {
     /// Scene-specific head.
     pub head: &'a SceneHead,
     /// Robust solver.
     pub solver: &'a PoseSolver,
-    /// Numbers that the head computes in.
+    /// Number format of the head.
     pub kind: Kind,
 }
 
-/// What came of one search.
+/// Result of one search.
 struct Attempt {
     found: FoundPose,
-    /// Share of the cells that agree with it in the end.
-    agreement: f64,
+    /// Final inlier ratio.
+    inlier_ratio: f64,
 }
 
 impl PoseSearch<'_> {
-    /// The pose that most cells agree on in the end; `again` are the cells of the second look.
+    /// The pose with the most inliers after refinement; `refinement_cells` are the cells of the refinement.
     ///
     /// # Errors
-    /// The tensor library's. That there is no pose is an answer.
+    /// Those of the tensor library. A sweep without a pose is a result, not an error.
     pub fn run(
         &self,
         coordinates: &SceneCoordinates,
-        again: &SweepCells,
+        refinement_cells: &SweepCells,
         times: &mut SearchTimes,
     ) -> Result<Solved, TchError> {
-        let agreement = |attempt: &Result<Attempt, _>| attempt.as_ref().map_or(-1.0, |attempt| attempt.agreement);
-        let mut best = self.attempt(coordinates, again, WIDENING[0], times)?;
+        let inlier_ratio = |attempt: &Result<Attempt, _>| attempt.as_ref().map_or(-1.0, |attempt| attempt.inlier_ratio);
+        let mut best = self.attempt(coordinates, refinement_cells, WIDENING[0], times)?;
         for &factor in &WIDENING[1..] {
-            if agreement(&best) >= SURE {
+            if inlier_ratio(&best) >= SUFFICIENT_RATIO {
                 break;
             }
-            let next = self.attempt(coordinates, again, factor, times)?;
-            if agreement(&next) > agreement(&best) {
+            let next = self.attempt(coordinates, refinement_cells, factor, times)?;
+            if inlier_ratio(&next) > inlier_ratio(&best) {
                 best = next;
             }
         }
         Ok(best.map(|best| best.found))
     }
 
-    /// One search, for cells that may be off by `factor` times the usual, and the second look from where it led.
+    /// One search, for cells with `factor` times the usual error, and the refinement of its result.
     fn attempt(
         &self,
         coordinates: &SceneCoordinates,
-        again: &SweepCells,
+        refinement_cells: &SweepCells,
         factor: f64,
         times: &mut SearchTimes,
     ) -> Result<Result<Attempt, NoRegistration>, TchError> {
         let start = Instant::now();
-        let rough = self.solver.search_wider(coordinates, factor);
+        let coarse = self.solver.search_wider(coordinates, factor);
         times.solve += start.elapsed();
-        let rough = match rough {
-            Ok(rough) => rough,
+        let coarse = match coarse {
+            Ok(coarse) => coarse,
             Err(none) => return Ok(Err(none)),
         };
         let start = Instant::now();
-        let (pose, is_wide) = (rough.target_from_source, factor > 1.0);
-        let second = refine(self.head, again, &pose, is_wide, self.kind)?;
-        let found = self.solver.judge(coordinates, &rough, second.as_ref());
-        let agreement = second.map_or(rough.inlier_ratio, |second| second.registration.inlier_ratio);
+        let (pose, is_wide) = (coarse.target_from_source, factor > 1.0);
+        let refined = refine(self.head, refinement_cells, &pose, is_wide, self.kind)?;
+        let found = self.solver.judge(coordinates, &coarse, refined.as_ref());
+        let inlier_ratio = refined.map_or(coarse.inlier_ratio, |refined| refined.registration.inlier_ratio);
         times.refine += start.elapsed();
-        Ok(Ok(Attempt { found, agreement }))
+        Ok(Ok(Attempt { found, inlier_ratio }))
     }
 }

@@ -1,4 +1,4 @@
-//! From scene coordinates to a pose that knows how far to trust it, or to the reason why there is none.
+//! Pose solver: from scene coordinates to a pose with its confidence, or to the reason why there is none.
 
 use nalgebra::{Isometry3, Vector3};
 use protocol::{NoPoseReason, PoseEstimate};
@@ -11,10 +11,10 @@ use crate::registration::ransac::{self, RansacConfig};
 use crate::registration::sc2pcr::{self, Sc2PcrConfig};
 use crate::registration::{NoRegistration, Registration};
 
-/// Sweeps with fewer cells are not localised.
+/// Fewest cells of a sweep that is localized.
 pub(crate) const MIN_CELLS: usize = 30;
 
-/// Which search finds the pose.
+/// Search for the pose.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Solver {
     /// Random samples with local optimisation.
@@ -29,36 +29,36 @@ impl Default for Solver {
     }
 }
 
-/// Solver and judge.
+/// Solver with a confidence model.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct PoseSolver {
-    /// Finds the pose.
+    /// Search for the pose.
     pub solver: Solver,
-    /// Says how far to trust it.
+    /// Confidence of the pose.
     pub confidence: Confidence,
 }
 
-/// A pose with what speaks for it.
+/// A pose with its evidence.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FoundPose {
-    /// Where the LiDAR is.
+    /// Pose of the LiDAR in the world.
     pub world_from_sensor: Isometry3<f64>,
-    /// What speaks for it.
+    /// Evidence for the pose.
     pub evidence: PoseEvidence,
-    /// How far to trust it, 0..=1.
+    /// Confidence, 0..=1.
     pub sigma: f64,
-    /// Whether that is too little to tell anyone.
+    /// True if the confidence is below the threshold: the pose is not published.
     pub is_withheld: bool,
 }
 
-/// The pose of one sweep, withheld or not, or why there is none.
+/// The pose of one sweep, rejected or not, or the reason why there is none.
 pub type Solved = Result<FoundPose, NoRegistration>;
 
 impl PoseSolver {
     /// Solves one sweep.
     ///
     /// # Errors
-    /// [`NoRegistration`] when there are too few cells, or too few of them agree.
+    /// [`NoRegistration`] when there are too few cells or too few inliers.
     pub fn solve(&self, coordinates: &SceneCoordinates) -> Solved {
         self.search(coordinates).map(|registration| self.judge(coordinates, &registration, None))
     }
@@ -71,7 +71,7 @@ impl PoseSolver {
         self.search_wider(coordinates, 1.0)
     }
 
-    /// The same with cells that may be off by `factor` times as much. Who agrees is counted as in [`Self::search`].
+    /// The same for cells with `factor` times the error. Inliers are counted as in [`Self::search`].
     ///
     /// # Errors
     /// As [`Self::solve`].
@@ -93,7 +93,7 @@ impl PoseSolver {
         Ok(if is_wider { Registration::judge(&pairs, found.target_from_source, threshold_m) } else { found })
     }
 
-    /// Last step: how far to trust what was found, and found again by a second look where there was one.
+    /// Last step: confidence of the pose after refinement, if there was one.
     pub(super) fn judge(
         &self,
         coordinates: &SceneCoordinates,
@@ -109,7 +109,7 @@ impl PoseSolver {
     }
 }
 
-/// What is told to others of a sweep.
+/// The estimate of a sweep that is published.
 #[must_use]
 pub fn estimate(solved: &Solved) -> PoseEstimate {
     let none = |reason, inliers: usize| PoseEstimate::NoPose {
@@ -133,14 +133,14 @@ mod tests {
     use crate::pgc::synthetic::SyntheticScene;
 
     #[test]
-    fn a_sweep_is_found_far_from_the_origin_of_the_world() {
-        let town = SyntheticScene::default();
+    fn a_sweep_is_localized_far_from_the_origin_of_the_world() {
+        let scene = SyntheticScene::default();
         for solver in [Solver::default(), Solver::Sc2Pcr(Sc2PcrConfig::default())] {
             let solver = PoseSolver { solver, ..PoseSolver::default() };
             for seed in 0..5 {
-                let solved = solver.solve(&town.coordinates(seed));
+                let solved = solver.solve(&scene.coordinates(seed));
                 let found = solved.as_ref().unwrap();
-                let off = town.world_from_sensor(seed).inv_mul(&found.world_from_sensor);
+                let off = scene.world_from_sensor(seed).inv_mul(&found.world_from_sensor);
                 assert!(off.translation.vector.norm() < 0.1, "{off}");
                 assert_eq!(estimate(&solved).confidence(), found.sigma as f32);
                 assert!(found.sigma > 0.5);
@@ -150,13 +150,13 @@ mod tests {
 
     #[test]
     fn cells_that_are_metres_off_are_found_by_a_wider_search() {
-        let town = SyntheticScene { noise_m: 2.5, outliers: 0.3, ..SyntheticScene::default() };
+        let scene = SyntheticScene { noise_m: 2.5, outliers: 0.3, ..SyntheticScene::default() };
         let solver = PoseSolver::default();
         let off_m = |factor| {
-            let errors = (0..6).map(|seed| match solver.search_wider(&town.coordinates(seed), factor) {
+            let errors = (0..6).map(|seed| match solver.search_wider(&scene.coordinates(seed), factor) {
                 Ok(found) => {
-                    let truth = town.world_from_sensor(seed).translation.vector
-                        - Vector3::from(town.coordinates(seed).origin_m);
+                    let truth = scene.world_from_sensor(seed).translation.vector
+                        - Vector3::from(scene.coordinates(seed).origin_m);
                     (found.target_from_source.translation.vector - truth).norm()
                 }
                 Err(_) => f64::INFINITY,
@@ -167,20 +167,20 @@ mod tests {
     }
 
     #[test]
-    fn what_is_thin_is_no_pose_and_says_why() {
-        let reason = |town: &SyntheticScene| match estimate(&PoseSolver::default().solve(&town.coordinates(3))) {
+    fn thin_evidence_gives_no_pose_but_a_reason() {
+        let reason = |scene: &SyntheticScene| match estimate(&PoseSolver::default().solve(&scene.coordinates(3))) {
             PoseEstimate::NoPose { reason, .. } => Some(reason),
             PoseEstimate::Pose { .. } => None,
         };
-        let town = SyntheticScene::default();
-        assert_eq!(reason(&town), None);
-        assert_eq!(reason(&SyntheticScene { cells: 0, ..town.clone() }), Some(NoPoseReason::TooFewPoints));
-        assert_eq!(reason(&SyntheticScene { cells: 10, ..town.clone() }), Some(NoPoseReason::TooFewPoints));
-        assert_eq!(reason(&SyntheticScene { outliers: 1.0, ..town }), Some(NoPoseReason::TooFewInliers));
+        let scene = SyntheticScene::default();
+        assert_eq!(reason(&scene), None);
+        assert_eq!(reason(&SyntheticScene { cells: 0, ..scene.clone() }), Some(NoPoseReason::TooFewPoints));
+        assert_eq!(reason(&SyntheticScene { cells: 10, ..scene.clone() }), Some(NoPoseReason::TooFewPoints));
+        assert_eq!(reason(&SyntheticScene { outliers: 1.0, ..scene }), Some(NoPoseReason::TooFewInliers));
     }
 
     #[test]
-    fn numbers_that_are_none_are_no_pose() {
+    fn nan_gives_no_pose() {
         let mut coordinates = SyntheticScene::default().coordinates(1);
         coordinates.world_m.iter_mut().for_each(|point| point[1] = f32::NAN);
         let none = estimate(&PoseSolver::default().solve(&coordinates));
@@ -191,11 +191,11 @@ mod tests {
     }
 
     #[test]
-    fn a_pose_that_little_speaks_for_is_withheld_with_its_inliers() {
+    fn a_pose_with_little_evidence_is_rejected_with_its_inliers() {
         let strict = ConfidenceModel { withhold_below: 0.99, ..ConfidenceModel::example() };
         let solver = PoseSolver { confidence: Confidence::Calibrated(strict), ..PoseSolver::default() };
-        let town = SyntheticScene { outliers: 0.8, noise_m: 0.6, ..SyntheticScene::default() };
-        let solved = solver.solve(&town.coordinates(1));
+        let scene = SyntheticScene { outliers: 0.8, noise_m: 0.6, ..SyntheticScene::default() };
+        let solved = solver.solve(&scene.coordinates(1));
         let found = solved.as_ref().unwrap();
         let PoseEstimate::NoPose { reason, inlier_count } = estimate(&solved) else { panic!("{solved:?}") };
         assert_eq!((reason, inlier_count as usize), (NoPoseReason::LowConfidence, found.evidence.inliers));

@@ -1,4 +1,4 @@
-//! How far a fitted pose may be off, from the cells that it rests on.
+//! Standard deviation of a fitted pose, from the cells that it was fitted to.
 
 use nalgebra::{Isometry3, Matrix3, Matrix6, Point3, SMatrix, Vector3};
 
@@ -7,23 +7,23 @@ use crate::registration::Correspondence;
 /// Standard deviations of a pose.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct PoseStd {
-    /// Of the position, all axes together, metres.
+    /// Standard deviation of the position, all axes together, metres.
     pub(super) position_m: f64,
-    /// Of the position along the axis that is known worst, metres: along the road, mostly.
+    /// Standard deviation of the position along its worst axis, metres: along the road, mostly.
     pub(super) worst_axis_m: f64,
-    /// Of the orientation, all axes together, radians.
+    /// Standard deviation of the orientation, all axes together, radians.
     pub(super) rotation_rad: f64,
 }
 
 impl PoseStd {
-    /// Where the cells do not bound the pose.
+    /// Value for cells that do not constrain the pose.
     pub(super) const UNBOUNDED: Self = Self { position_m: 1e3, worst_axis_m: 1e3, rotation_rad: 1e3 };
 
-    /// Of the weighted fit of `target_from_source` to pairs, each with its weight there.
+    /// Standard deviations of the weighted fit of `target_from_source` to pairs, each with its weight there.
     ///
-    /// The sandwich estimator of White (1980), `A B A` with the inverse of the normal equations `A` and the outer products
-    /// of the pairs' gradients `B`: pairs may differ in how well they are known. That neighbours err together makes it
-    /// too small by a factor, but right in how it compares from sweep to sweep.
+    /// The sandwich estimator of White (1980), `A B A` with the inverse of the normal equations `A` and the outer
+    /// products of the pairs' gradients `B`: pairs may differ in their errors. Errors of neighbouring cells are
+    /// correlated, which makes it too small by a factor, but the ratio between sweeps is right.
     pub(super) fn of<'a>(
         target_from_source: &Isometry3<f64>,
         pairs: impl Iterator<Item = (&'a Correspondence, f64)>,
@@ -32,7 +32,7 @@ impl PoseStd {
         for (pair, weight) in pairs {
             let arm = target_from_source.rotation * Point3::from(pair.source_m.map(f64::from)).coords;
             let residual = arm + target_from_source.translation.vector - Vector3::from(pair.target_m.map(f64::from));
-            // d(residual) = dt + dw x arm, for a small turn dw about the sensor.
+            // d(residual) = dt + dw x arm, for a small rotation dw about the sensor.
             let mut jacobian = SMatrix::<f64, 3, 6>::zeros();
             jacobian.fixed_view_mut::<3, 3>(0, 0).copy_from(&Matrix3::identity());
             jacobian.fixed_view_mut::<3, 3>(0, 3).copy_from(&(-arm.cross_matrix()));
@@ -48,7 +48,7 @@ impl PoseStd {
         };
         let variance = |from: usize| (from..from + 3).map(|axis| covariance[(axis, axis)]).sum();
         let position = covariance.fixed_view::<3, 3>(0, 0);
-        // Of a matrix that is not finite there are no eigenvalues to ask for.
+        // A matrix that is not finite has no eigenvalues.
         let worst_axis = if position.iter().all(|entry| entry.is_finite()) {
             position.into_owned().symmetric_eigenvalues().max()
         } else {
@@ -69,7 +69,7 @@ mod tests {
     use crate::registration::synthetic::Problem;
 
     #[test]
-    fn it_is_as_large_as_fits_really_differ() {
+    fn it_matches_the_spread_of_fits() {
         let (mut square_m, mut expected_m) = (0.0_f64, 0.0_f64);
         for seed in 0..200 {
             let problem = Problem { count: 80, outliers: 0.0, noise_m: 0.3, ..Problem::default() }.drawn(seed);
@@ -107,7 +107,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_bounds_nothing() {
+    fn no_pairs_constrain_nothing() {
         assert_eq!(PoseStd::of(&Isometry3::identity(), std::iter::empty()), PoseStd::UNBOUNDED);
     }
 }

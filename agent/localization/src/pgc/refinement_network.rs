@@ -1,9 +1,9 @@
-//! The second look: once a sweep's pose is known to a metre or two, where exactly is each cell.
+//! Refinement network: predicts the position of each cell, given the sweep's pose to a metre or two.
 //!
-//! The head answers from the whole town; the refiner only looks around. A lattice over the town holds a learnt key for
-//! every corner. What the cell looks like is the query, the corners around the place where the pose puts the cell are
-//! the candidates, and the answer is their mean by attention. Neither the paper nor LightLoc has this stage; the
-//! solver's 'final refinement' is run on its answers.
+//! The head predicts positions in the whole scene; the refiner searches a window. A key grid over the scene holds a
+//! learnt key for every corner. The feature of the cell is the query, the corners around the position that the pose
+//! gives the cell are the candidates, and the prediction is their mean by attention. Neither the paper nor LightLoc has
+//! this stage; the solver's 'final refinement' is run on its predictions.
 
 use tch::nn::{self, Init};
 use tch::{Kind, TchError, Tensor};
@@ -13,16 +13,16 @@ use super::error::LocalizerError;
 use super::head_config::RefinerConfig;
 use super::scene_regression::Regression;
 
-/// Similarities are multiplied by this at first; learnt from there on.
+/// Initial factor of the similarities; learnt from there on.
 const FIRST_SHARPNESS: f64 = 2.0;
 
-/// Finds cells on a learnt lattice over the town.
+/// Locates cells on a learnt key grid over the scene.
 #[derive(Debug)]
 pub struct Refiner {
     config: RefinerConfig,
     /// `[corners, keys]`.
     keys: Tensor,
-    /// `[corners, 1]`: height of what stands there, metres.
+    /// `[corners, 1]`: height of the surface at each corner, metres.
     heights: Tensor,
     sharpness: Tensor,
     inward: Dense,
@@ -56,13 +56,13 @@ impl Refiner {
         })
     }
 
-    /// What it was built from.
+    /// Configuration that it was built from.
     #[must_use]
     pub fn config(&self) -> &RefinerConfig {
         &self.config
     }
 
-    /// Where cells really are, given where a pose puts them.
+    /// Predicted positions of cells, given their positions under a pose.
     ///
     /// # Shapes and frames
     /// - `cells`: `[N, channels >= local_channels]`, normalised features; the first `local_channels` are used
@@ -70,7 +70,7 @@ impl Refiner {
     /// - `heading`: `[N, 2]`, cosine and sine of the sensor's heading in the world
     ///
     /// # Errors
-    /// The tensor library's.
+    /// Those of the tensor library.
     pub fn look(
         &self,
         cells: &Tensor,
@@ -90,7 +90,7 @@ impl Refiner {
         let plane_m = shares.f_bmm(&window.places_m)?.f_squeeze_dim(1)?;
         let floor_m = shares.f_bmm(&gather(&self.heights, &window.corners)?)?.f_squeeze_dim(1)?;
         let above_m = self.height.forward(&hidden)?.f_to_kind(Kind::Float)?;
-        // How far the shares are spread, and how large the largest is, tell how sure the answer is.
+        // The spread of the attention weights and the largest of them indicate the error of the prediction.
         let square = shares.f_bmm(&window.places_m.f_square()?)?.f_squeeze_dim(1)?;
         let spread =
             (square - plane_m.f_square()?).f_sum_dim_intlist(1_i64, true, Kind::Float)?.f_clamp_min(1e-6)?.f_sqrt()?;
@@ -103,7 +103,7 @@ impl Refiner {
         })
     }
 
-    /// The corners around each place.
+    /// The corners around each position.
     fn window(&self, assumed_m: &Tensor) -> Result<Window, TchError> {
         let RefinerConfig { spacing_m, reach, low_m, .. } = &self.config;
         let [columns, rows] = self.config.corners();
@@ -133,9 +133,9 @@ impl Refiner {
 struct Window {
     /// `[N, K]` rows of keys.
     corners: Tensor,
-    /// `[N, K, 2]`: where they are relative to the middle, metres.
+    /// `[N, K, 2]`: positions relative to the centre, metres.
     places_m: Tensor,
-    /// `[N, 2]`: the corner in the middle, metres relative to the head's origin.
+    /// `[N, 2]`: the central corner, metres relative to the head's origin.
     middle_m: Tensor,
 }
 
@@ -174,7 +174,7 @@ mod tests {
     }
 
     #[test]
-    fn answers_lie_within_the_window_around_the_assumption() {
+    fn predictions_lie_within_the_window_around_the_assumption() {
         let (_network, refiner) = refiner();
         let assumed = Tensor::from_slice(&[1.3f32, 2.2, 3.0, -7.9, 11.0, 0.0]).view([2, 3]);
         let cells = Tensor::randn([2, 6], (Kind::Float, Device::Cpu)) * 5.0;
@@ -198,7 +198,7 @@ mod tests {
     }
 
     #[test]
-    fn places_outside_are_sought_at_the_edge() {
+    fn positions_outside_are_clamped_to_the_edge() {
         let (_network, refiner) = refiner();
         let assumed = Tensor::from_slice(&[1e4f32, -1e4, 0.0, f32::MAX, f32::MIN, 0.0]).view([2, 3]);
         let window = refiner.window(&assumed).unwrap();

@@ -1,4 +1,4 @@
-//! The sparse encoder: what a place looks like, wherever the town is.
+//! Sparse encoder: features of places, independent of the scene.
 
 use std::path::Path;
 
@@ -11,7 +11,7 @@ use super::voxel_batch::VoxelBatch;
 use perception::sparse::{GatherIndex, SparseConv};
 use perception::weights::Weights;
 
-/// What the encoder makes of some sweeps.
+/// Output of the encoder for some sweeps.
 #[derive(Debug)]
 pub struct SceneFeatures {
     /// `[cells, cell_channels]`.
@@ -40,7 +40,7 @@ pub struct SceneEncoder {
 }
 
 impl SceneEncoder {
-    /// Kind of the weights, as their file says it.
+    /// Kind of the weights, as in their file.
     pub const KIND: &'static str = "scene encoder";
 
     /// Builds the layers below `path`.
@@ -64,10 +64,11 @@ impl SceneEncoder {
         Ok(Self { config: config.clone(), first, down, fine, coarse })
     }
 
-    /// Reads an encoder from a weights file, configuration inside, frozen. Returns the file's SHA-256 beside it.
+    /// Reads an encoder from a weights file that contains its configuration, frozen. Returns the file's SHA-256 beside
+    /// it.
     ///
     /// # Errors
-    /// [`LocalizerError`] when the file is missing, cut off or of something else.
+    /// [`LocalizerError`] when the file is missing, truncated or of another kind.
     pub fn load(path: &Path, device: Device) -> Result<(Self, String), LocalizerError> {
         let weights = Weights::load(path)?;
         weights.check_kind(Self::KIND)?;
@@ -79,7 +80,7 @@ impl SceneEncoder {
         Ok((encoder, weights.sha256().to_owned()))
     }
 
-    /// What it was built from.
+    /// Configuration that it was built from.
     #[must_use]
     pub fn config(&self) -> &SceneEncoderConfig {
         &self.config
@@ -88,7 +89,7 @@ impl SceneEncoder {
     /// Features of cells and coarse cells, computed in `kind`. Differentiable.
     ///
     /// # Errors
-    /// The tensor library's.
+    /// Those of the tensor library.
     pub fn local(&self, batch: &VoxelBatch, kind: Kind) -> Result<LocalFeatures, TchError> {
         let mut x = self.first.forward(&batch.input.to_kind(kind), &batch.first)?.f_relu()?;
         let mut fine = None;
@@ -114,13 +115,13 @@ impl SceneEncoder {
     /// Features of cells with their surroundings, and of the sweeps.
     ///
     /// # Errors
-    /// The tensor library's.
+    /// Those of the tensor library.
     pub fn complete(&self, local: &LocalFeatures, batch: &VoxelBatch) -> Result<SceneFeatures, TchError> {
         let mut parts = vec![local.cells.shallow_clone()];
         if !self.config.context_m.is_empty() {
             let plane = Plane::new(&local.coarse, batch)?;
             for edge_m in &self.config.context_m {
-                // Odd, so that the cell is in the middle.
+                // Odd, so that the cell is in the centre.
                 let window = 2 * (edge_m / self.config.coarse_cell_m() / 2.0).round() as i64 + 1;
                 let context = rows(&plane.mean_over(window)?, &batch.columns)?;
                 parts.push(rows(&context.to_kind(local.cells.kind()), &batch.coarse_of_cell)?);
@@ -140,7 +141,7 @@ impl SceneEncoder {
     /// Both steps without gradients.
     ///
     /// # Errors
-    /// The tensor library's.
+    /// Those of the tensor library.
     pub fn encode(&self, batch: &VoxelBatch, kind: Kind) -> Result<SceneFeatures, TchError> {
         no_grad(|| self.complete(&self.local(batch, kind)?, batch))
     }
@@ -151,7 +152,7 @@ fn rows(x: &Tensor, index: &Tensor) -> Result<Tensor, TchError> {
     x.f_gather(0, &index.f_unsqueeze(1)?.f_expand([-1, x.size()[1]], false)?, false)
 }
 
-/// Two 3x3x3 convolutions with a 1x1 one between them, around which the input passes by.
+/// Two 3x3x3 convolutions with a 1x1 one between them, and a skip connection.
 #[derive(Debug)]
 struct ResidualGroup {
     inward: SparseConv,
@@ -192,7 +193,7 @@ impl ResidualGroup {
 struct Plane {
     /// `[sweeps, channels, edge, edge]`.
     sum: Tensor,
-    /// `[sweeps, 1, edge, edge]`: how many coarse cells lie above one another.
+    /// `[sweeps, 1, edge, edge]`: number of coarse cells above one another.
     count: Tensor,
 }
 

@@ -1,4 +1,4 @@
-//! The head that belongs to one town: which part of it a sweep was made in, and where in the world each cell lies.
+//! Scene-specific head: classifies the part of the scene of a sweep and predicts the world coordinates of each cell.
 
 use tch::nn::{self, LinearConfig, Module};
 use tch::{Kind, TchError, Tensor};
@@ -17,7 +17,7 @@ const DROPOUT: f64 = 0.5;
 /// Unit of the offset from the weighted centres, metres.
 const OFFSET_SCALE_M: f64 = 10.0;
 
-/// What the head says of some cells.
+/// Output of the head for some cells.
 #[derive(Debug)]
 pub struct Regression {
     /// `[N, 3]`: world coordinates relative to the origin, metres.
@@ -43,7 +43,7 @@ pub struct SceneHead {
 }
 
 impl SceneHead {
-    /// Kind of the weights, as their file says it.
+    /// Kind of the weights, as in their file.
     pub const KIND: &'static str = "scene head";
 
     /// Builds the layers below `path`.
@@ -70,46 +70,47 @@ impl SceneHead {
         })
     }
 
-    /// What it was built from.
+    /// Configuration that it was built from.
     #[must_use]
     pub fn config(&self) -> &SceneHeadConfig {
         &self.config
     }
 
-    /// The second look, where there is one.
+    /// Pose refinement network, if there is one.
     #[must_use]
     pub fn refiner(&self) -> Option<&Refiner> {
         self.refiner.as_ref()
     }
 
-    /// Features of cells with mean 0 and deviation 1 over the training sweeps.
+    /// Normalises features of cells to mean 0 and deviation 1 over the training sweeps.
     ///
     /// # Errors
-    /// The tensor library's.
+    /// Those of the tensor library.
     pub fn normalise(&self, cells: &Tensor) -> Result<Tensor, TchError> {
         self.cell_norm.forward(cells)
     }
 
-    /// Which part of town, `[sweeps, classes]` logits of `[sweeps, sweep_channels]`; with `train` channels drop out.
+    /// Part of the scene: `[sweeps, classes]` logits of `[sweeps, sweep_channels]`; with `train` dropout is applied.
     ///
     /// # Errors
-    /// The tensor library's.
+    /// Those of the tensor library.
     pub fn classify(&self, sweeps: &Tensor, train: bool) -> Result<Tensor, TchError> {
         self.classifier.forward(&self.sweep_norm.forward(sweeps)?, train)
     }
 
-    /// World coordinates of `[N, cell_channels]` normalised features, given the logits `[N, classes]` of the sweep that each is part of.
+    /// World coordinates of `[N, cell_channels]` normalised features, given the logits `[N, classes]` of the sweep of
+    /// each.
     ///
     /// # Errors
-    /// The tensor library's.
+    /// Those of the tensor library.
     pub fn regress(&self, cells: &Tensor, logits: &Tensor, kind: Kind) -> Result<Regression, TchError> {
         Ok(self.regress_among_centres(cells, logits, kind)?.0)
     }
 
-    /// The same, and the logarithms `[N, centres]` of the shares that the centres have in each answer.
+    /// The same, and the logarithms `[N, centres]` of the weights of the centres in each prediction.
     ///
     /// # Errors
-    /// The tensor library's.
+    /// Those of the tensor library.
     pub fn regress_among_centres(
         &self,
         cells: &Tensor,
@@ -132,16 +133,16 @@ impl SceneHead {
         Ok((Regression { coordinates_m, epsilon_m }, log_shares))
     }
 
-    /// `[centres, 3]`: what cells are placed among, metres relative to the origin.
+    /// `[centres, 3]`: reference points of the cells' offsets, metres relative to the origin.
     pub fn centres_m(&self) -> &Tensor {
         &self.centres
     }
 
-    /// Sets what is computed from the training data, not learnt: statistics of the features `[N, cell_channels]` and
-    /// `[S, sweep_channels]`, and the centres.
+    /// Sets the values that are computed from the training data, not learnt: statistics of the features `[N,
+    /// cell_channels]` and `[S, sweep_channels]`, and the centres.
     ///
     /// # Errors
-    /// The tensor library's, when shapes do not fit.
+    /// Those of the tensor library, when shapes do not fit.
     pub fn set_statistics(&mut self, cells: &Tensor, sweeps: &Tensor, centres: &Tensor) -> Result<(), TchError> {
         self.cell_norm.fit(cells)?;
         self.sweep_norm.fit(sweeps)?;

@@ -1,4 +1,4 @@
-//! Synthetic scene coordinates: a town without a network whose cells have drawn errors, for tests and benches.
+//! Synthetic scene coordinates: cells with drawn errors, without a network, for tests and benches.
 
 use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
 use protocol::PointCloud;
@@ -10,21 +10,21 @@ use super::error::LocalizerError;
 use super::localize::{Localization, Localize, LocalizerTimes, SceneCoordinates};
 use super::pose_solver::PoseSolver;
 
-/// Where the world's coordinates begin: far away, as in maps in UTM coordinates.
+/// Origin of the scene in the world: far away, as in maps in UTM coordinates, metres.
 const ORIGIN_M: [f64; 3] = [500_000.0, 5_700_000.0, 100.0];
 
-/// What the cells of its sweeps are like.
+/// Error distribution of the cells of a scene's sweeps.
 #[derive(Debug, Clone)]
 pub struct SyntheticScene {
-    /// Cells of a sweep.
+    /// Number of cells of a sweep.
     pub cells: usize,
-    /// Share of cells that are anywhere in town.
+    /// Share of cells with a random position in the scene, 0..=1.
     pub outliers: f64,
-    /// Share of the others that are taken for another place that looks alike, 25 m away.
+    /// Share of the others that are mistaken for a similar place, 25 m away, 0..=1.
     pub twins: f64,
-    /// Standard deviation of the rest per axis, metres.
+    /// Standard deviation of the others per axis, metres.
     pub noise_m: f64,
-    /// Seed of the next sweep that is asked for; the sweep itself does not count.
+    /// Seed of the next sweep; the content of the sweep is not used.
     pub next_seed: u64,
 }
 
@@ -35,7 +35,7 @@ impl Default for SyntheticScene {
 }
 
 impl SyntheticScene {
-    /// Where the sweep of a seed was made.
+    /// True pose of the sweep of a seed.
     pub fn world_from_sensor(&self, seed: u64) -> Isometry3<f64> {
         let mut local = local_pose(seed);
         local.translation.vector += Vector3::from(ORIGIN_M);
@@ -51,18 +51,18 @@ impl SyntheticScene {
         for _ in 0..self.cells {
             let mut within = |reach: f64| random.random_range(-reach..reach);
             let sensor = Point3::new(within(50.0), within(50.0), within(5.0));
-            let mut believed = pose * sensor;
+            let mut predicted = pose * sensor;
             if random.random_bool(self.twins) {
-                // The network does not know that it is wrong.
-                believed += Vector3::new(24.0, 7.0, 0.0);
+                // The predicted error does not show the mistake.
+                predicted += Vector3::new(24.0, 7.0, 0.0);
             }
             let world = if random.random_bool(self.outliers) {
                 let mut within = |reach: f64| random.random_range(-reach..reach);
                 Point3::new(within(200.0), within(200.0), within(5.0))
             } else {
-                believed + Vector3::from_fn(|_, _| noise.sample(&mut random))
+                predicted + Vector3::from_fn(|_, _| noise.sample(&mut random))
             };
-            let off_m = (world - believed).abs().sum().min(10.0);
+            let off_m = (world - predicted).abs().sum().min(10.0);
             coordinates.epsilon_m.push((off_m * random.random_range(0.5..1.5)) as f32);
             coordinates.sensor_m.push(sensor.coords.map(|axis| axis as f32).into());
             coordinates.world_m.push(world.coords.map(|axis| axis as f32).into());

@@ -1,4 +1,4 @@
-//! Sweeps as the tensors of one forward pass.
+//! Batch of sweeps as the tensors of one forward pass.
 
 use std::ops::Range;
 
@@ -8,7 +8,7 @@ use super::encoder_config::SceneEncoderConfig;
 use super::voxelise::{SweepVoxels, plane_edge};
 use perception::sparse::{GatherIndex, Rulebook};
 
-/// One or more sweeps, their rows one after another. No sweep sees another.
+/// One or more sweeps, their rows one after another. Sweeps do not influence each other.
 #[derive(Debug)]
 pub struct VoxelBatch {
     pub(super) input: Tensor,
@@ -18,7 +18,7 @@ pub struct VoxelBatch {
     pub(super) coarse: GatherIndex,
     /// `[cells]` of rows of the last level.
     pub(super) coarse_of_cell: Tensor,
-    /// `[rows of the last level]`: place in the planes of all sweeps.
+    /// `[rows of the last level]`: index into the planes of all sweeps.
     pub(super) columns: Tensor,
     /// Edge of a plane, cells of the last level.
     pub(super) plane_edge: i64,
@@ -29,10 +29,10 @@ pub struct VoxelBatch {
 }
 
 impl VoxelBatch {
-    /// Puts sweeps together.
+    /// Builds the batch.
     ///
     /// # Errors
-    /// The tensor library's.
+    /// Those of the tensor library.
     pub fn new(sweeps: &[&SweepVoxels], config: &SceneEncoderConfig, device: Device) -> Result<Self, TchError> {
         let input: Vec<f32> = sweeps.iter().flat_map(|sweep| &sweep.input).copied().collect();
         let input = Tensor::f_from_slice(&input)?.f_view([-1, config.input.channels()])?.f_to_device(device)?;

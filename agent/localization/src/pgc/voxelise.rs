@@ -1,4 +1,4 @@
-//! A sweep as voxels, cells and the rulebooks of its convolutions: everything that needs no tensors.
+//! Voxels, cells and rulebooks of the convolutions of a sweep: everything that needs no tensors.
 
 use super::encoder_config::{SceneEncoderConfig, VoxelInput};
 use perception::sparse::{Rulebook, Sites};
@@ -6,7 +6,7 @@ use perception::sparse::{Rulebook, Sites};
 /// Units of coordinates that enter a network, metres.
 const INPUT_SCALE_M: f32 = 10.0;
 
-/// A place of the sweep that a scene coordinate is regressed for.
+/// A part of the sweep that a scene coordinate is regressed for.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Cell {
     /// Mean of its points, metres in the sensor frame.
@@ -18,10 +18,10 @@ pub struct Cell {
 }
 
 impl Cell {
-    /// Cells lower than this look the same everywhere, metres.
+    /// Height below which cells look the same everywhere, metres.
     const FLAT_M: f32 = 0.3;
 
-    /// Whether it is ground and nothing else, as far as its height tells.
+    /// True if it is flat ground, by its height.
     #[must_use]
     pub fn is_flat(&self) -> bool {
         self.extent_m < Self::FLAT_M
@@ -31,7 +31,7 @@ impl Cell {
 /// One sweep, ready for the encoder.
 #[derive(Debug, Clone)]
 pub struct SweepVoxels {
-    /// `[N, C]` of what describes a voxel.
+    /// `[N, C]` input features of voxels.
     pub(super) input: Vec<f32>,
     /// Stride 1 on the voxels.
     pub(super) first: Rulebook,
@@ -182,7 +182,7 @@ mod tests {
     }
 
     #[test]
-    fn a_cell_knows_its_middle() {
+    fn a_cell_has_the_mean_of_its_points() {
         let points = [[10.1, 0.3, 0.2], [10.3, 0.5, 1.2]];
         let sweep = SweepVoxels::new(points, &SceneEncoderConfig::lean());
         let [cell] = sweep.cells() else { panic!("{:?}", sweep.cells()) };
@@ -190,7 +190,7 @@ mod tests {
     }
 
     #[test]
-    fn an_empty_sweep_is_an_empty_answer() {
+    fn an_empty_sweep_has_no_voxels() {
         let sweep = SweepVoxels::new([], &SceneEncoderConfig::lean());
         assert!(sweep.cells().is_empty() && sweep.voxels() == 0);
     }

@@ -1,4 +1,4 @@
-//! Pose errors that a pose generator really made, one row per sweep.
+//! Table of measured pose errors of a pose generator, one row per sweep.
 
 use std::path::{Path, PathBuf};
 
@@ -9,12 +9,12 @@ use super::noise::PlanarError;
 /// The first line of a table.
 const HEADER: &str = "x_m,y_m,z_m,yaw_deg,confidence";
 
-/// Errors beyond this are no errors of a pose but of a file, metres.
+/// Largest error of a pose, metres: a larger one is an error of the file.
 const MAX_ERROR_M: f64 = 1e5;
 /// Largest file that is read, bytes.
 const MAX_BYTES: u64 = 64 << 20;
 
-/// Why a table of errors cannot be read.
+/// Error of reading a table.
 #[derive(Debug, thiserror::Error)]
 pub enum ErrorTableError {
     /// The file or a row of it cannot be used.
@@ -23,22 +23,22 @@ pub enum ErrorTableError {
     /// There is no row.
     #[error("{}: no row below the header", path.display())]
     Empty {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
     },
 }
 
-/// What happened to one sweep.
+/// Result of one sweep.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum TableRow {
     /// A pose with this error, in the vehicle's frame (x forward, y left).
     Pose {
-        /// How far off.
+        /// Error in position and heading.
         error: PlanarError,
-        /// What the generator thought of it, 0..=1.
+        /// Confidence of the generator, 0..=1.
         confidence: f32,
     },
-    /// None was found.
+    /// No pose.
     NoPose,
 }
 
@@ -60,7 +60,7 @@ impl ErrorTable {
         if rows.is_empty() { Err(ErrorTableError::Empty { path: path.to_owned() }) } else { Ok(Self { rows }) }
     }
 
-    /// The row of a step when the first step takes row `start`; the table is read round and round.
+    /// The row of a step if the first step has row `start`; after the last row comes the first one.
     #[must_use]
     pub fn row(&self, start: u64, step: u64) -> TableRow {
         let length = self.rows.len() as u64;
@@ -92,7 +92,7 @@ mod tests {
     }
 
     #[test]
-    fn rows_follow_each_other_round_and_round() {
+    fn rows_repeat_after_the_last() {
         let table = read("x_m,y_m,z_m,yaw_deg,confidence\n0.1,0,0,180,0.5\nno_pose\n\n").unwrap();
         let TableRow::Pose { error, confidence } = table.row(1, 1) else { panic!("{table:?}") };
         assert!((error.yaw_rad - std::f64::consts::PI).abs() < 1e-12 && confidence == 0.5);
@@ -101,7 +101,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wrong_is_named_with_file_line_and_column() {
+    fn errors_name_file_line_and_column() {
         let header = "x_m,y_m,z_m,yaw_deg,confidence\n";
         for (text, parts) in [
             ("a,b\n".to_owned(), ["errors.csv:1", "a,b"]),

@@ -1,4 +1,4 @@
-//! The pose from the sweep alone: no receiver, no recording.
+//! Pose source that estimates from the sweep alone: no receiver, no recording.
 
 use std::path::PathBuf;
 
@@ -12,7 +12,7 @@ use super::{PoseInput, PoseSource};
 use crate::competitors::EndToEndLocalizer;
 use crate::pgc::{Localize, Localizer, LocalizerError};
 
-/// The networks of a pose generator.
+/// Networks of PGC.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema, clap::Args)]
 #[serde(deny_unknown_fields)]
 pub struct PgcConfig {
@@ -22,26 +22,26 @@ pub struct PgcConfig {
     /// Weights of the scene-specific head (pose source pgc).
     #[arg(long, value_name = "FILE")]
     pub head: PathBuf,
-    /// Motion that the vehicle is capable of.
+    /// Motion limits of the vehicle.
     #[arg(skip)]
     #[serde(default)]
     pub sanity: MotionGateConfig,
 }
 
-/// A network that was trained end to end, to compare a pose generator with.
+/// A network that was trained end to end, a competitor of PGC.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema, clap::Args)]
 #[serde(deny_unknown_fields)]
 pub struct EndToEndPoseConfig {
     /// Weights of a network that was trained end to end on the scene (pose source end_to_end).
     #[arg(id = "end_to_end", long = "end-to-end", value_name = "FILE")]
     pub weights: PathBuf,
-    /// Motion that the vehicle is capable of.
+    /// Motion limits of the vehicle.
     #[arg(skip)]
     #[serde(default)]
     pub sanity: MotionGateConfig,
 }
 
-/// Localises every sweep and judges the pose by those before it.
+/// Localizes every sweep and checks the pose against earlier ones.
 #[derive(Debug)]
 pub struct LocalizedPose {
     localizer: Box<dyn Localize>,
@@ -50,7 +50,7 @@ pub struct LocalizedPose {
 }
 
 impl LocalizedPose {
-    /// Reads the networks of a pose generator, to compute with on the CPU.
+    /// Reads the networks of PGC, to compute with on the CPU.
     ///
     /// # Errors
     /// [`LocalizerError`] names the file and what is wrong with it.
@@ -68,7 +68,7 @@ impl LocalizedPose {
         Ok(Self::new(Box::new(localizer), config.sanity.clone()))
     }
 
-    /// The same with another way to localise.
+    /// The same with another localizer.
     #[must_use]
     pub fn new(localizer: Box<dyn Localize>, sanity: MotionGateConfig) -> Self {
         Self { localizer, sanity: MotionGate::new(sanity), times: Vec::new() }
@@ -76,7 +76,7 @@ impl LocalizedPose {
 }
 
 impl PoseSource for LocalizedPose {
-    /// Does not look at the measured pose.
+    /// Ignores the measured pose.
     fn estimate(&mut self, input: &PoseInput<'_>) -> PoseEstimate {
         self.times.clear();
         let estimate = match self.localizer.localize(input.cloud) {
@@ -118,7 +118,7 @@ mod tests {
     fn estimates(source: &mut LocalizedPose, count: u64) -> Vec<PoseEstimate> {
         let cav = CavId::new("7").unwrap();
         let cloud = PointCloud::default();
-        // A measured pose that is nowhere near: it must not matter.
+        // A measured pose far off: it must not matter.
         let measured = Pose::from_xyz_yaw([1.0, 2.0, 3.0], 0.4);
         let input =
             |step| PoseInput { cav: &cav, capture_nanos: step * 100_000_000, cloud: &cloud, measured: Some(&measured) };
@@ -127,14 +127,14 @@ mod tests {
 
     #[test]
     fn the_pose_comes_from_the_sweep_and_jumps_cost_confidence() {
-        let town = SyntheticScene::default();
-        let mut source = LocalizedPose::new(Box::new(town.clone()), MotionGateConfig::default());
+        let scene = SyntheticScene::default();
+        let mut source = LocalizedPose::new(Box::new(scene.clone()), MotionGateConfig::default());
         let found = estimates(&mut source, 2);
         for (seed, estimate) in found.iter().enumerate() {
-            let off = town.world_from_sensor(seed as u64).inv_mul(&estimate.world_from_cav().unwrap().isometry());
+            let off = scene.world_from_sensor(seed as u64).inv_mul(&estimate.world_from_cav().unwrap().isometry());
             assert!(off.translation.vector.norm() < 0.2);
         }
-        // Two places of a town at random, a tenth of a second apart.
+        // Two random places of a scene, a tenth of a second apart.
         assert!(found[1].confidence() < 0.3 * found[0].confidence());
         assert_eq!(source.jumps(), 1);
         assert_eq!(source.stages().len(), 5);
@@ -157,7 +157,7 @@ mod tests {
     }
 
     #[test]
-    fn no_pose_stays_no_pose() {
+    fn no_pose_remains_no_pose() {
         let empty = SyntheticScene { cells: 0, ..SyntheticScene::default() };
         let found = estimates(&mut LocalizedPose::new(Box::new(empty), MotionGateConfig::default()), 3);
         assert!(found.iter().all(|estimate| estimate.world_from_cav().is_none()));

@@ -1,7 +1,7 @@
-//! Where an agent's pose comes from.
+//! Pose sources: the origins of an agent's pose.
 //!
-//! One door for every source: the recording's own pose, that pose with an error of a chosen kind, and an estimate from
-//! the sweep alone. A source that has no pose says so; nothing is made up.
+//! One trait for every source: the recorded pose, that pose with an error of a chosen kind, and an estimate from the
+//! sweep alone. A source without a pose returns the reason; it never substitutes one.
 
 mod error_table;
 mod localized;
@@ -27,10 +27,10 @@ pub use pose_table::{CachedPose, CachedPoseConfig, PoseRow, PoseTable, PoseTable
 
 use crate::pgc::LocalizerError;
 
-/// What a source may look at for one sweep.
+/// Inputs of a source for one sweep.
 #[derive(Debug, Clone, Copy)]
 pub struct PoseInput<'a> {
-    /// Whose sweep.
+    /// Vehicle.
     pub cav: &'a CavId,
     /// Capture time on the clock of the scene, nanoseconds.
     pub capture_nanos: u64,
@@ -40,23 +40,23 @@ pub struct PoseInput<'a> {
     pub measured: Option<&'a Pose>,
 }
 
-/// Says where an agent is.
+/// Source of an agent's pose.
 pub trait PoseSource: std::fmt::Debug + Send {
-    /// The pose of one sweep with its confidence, or why there is none.
+    /// The pose of one sweep with its confidence, or the reason why there is none.
     fn estimate(&mut self, input: &PoseInput<'_>) -> PoseEstimate;
 
-    /// Where the time of the last estimate went, for sources that compute.
+    /// Durations of the stages of the last estimate, for sources that compute.
     fn stages(&self) -> &[StageTiming] {
         &[]
     }
 
-    /// Poses so far that the vehicle cannot have driven to from those before.
+    /// Number of poses so far that the vehicle cannot have reached from the previous ones.
     fn jumps(&self) -> u64 {
         0
     }
 }
 
-/// Takes the measured pose as it is, fully trusted.
+/// Returns the measured pose unchanged, with full confidence.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct RecordedPose;
 
@@ -69,7 +69,7 @@ impl PoseSource for RecordedPose {
     }
 }
 
-/// There is nothing to take a pose from.
+/// Result if there is no measured pose.
 pub const NO_SOURCE: PoseEstimate = PoseEstimate::NoPose { reason: NoPoseReason::NoSource, inlier_count: 0 };
 
 /// A pose source and its settings.
@@ -81,15 +81,15 @@ pub enum PoseSourceConfig {
     Recorded,
     /// The measured pose with an error.
     Noisy(NoisyPoseConfig),
-    /// From the sweep alone, by networks.
+    /// Estimated from the sweep alone, by PGC.
     Pgc(PgcConfig),
-    /// From the sweep alone, by a network that was trained end to end.
+    /// Estimated from the sweep alone, by a network that was trained end to end.
     EndToEnd(EndToEndPoseConfig),
-    /// From a table that `agent localize` wrote.
+    /// Read from a table that `agent localize` wrote.
     Cached(CachedPoseConfig),
 }
 
-/// An error on the measured pose.
+/// Error that is added to the measured pose.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema, clap::Args)]
 #[serde(default, deny_unknown_fields)]
 pub struct NoisyPoseConfig {
@@ -102,7 +102,7 @@ pub struct NoisyPoseConfig {
     /// Standard deviation of yaw, degrees (pose source noisy).
     #[arg(id = "noise_heading_std_deg", long = "noise-heading-std-deg", value_name = "DEG")]
     pub heading_std_deg: f64,
-    /// Same seed, same errors (pose source noisy).
+    /// Seed of the errors (pose source noisy).
     #[arg(id = "noise_seed", long = "noise-seed", value_name = "SEED")]
     pub seed: u64,
     /// Time between two draws of the modes that depend on time, seconds (pose source noisy).
@@ -135,7 +135,7 @@ impl NoisyPoseConfig {
     /// Checks the values.
     ///
     /// # Errors
-    /// [`FieldError`] for the first that is not allowed.
+    /// [`FieldError`] of the first value that is out of range.
     pub fn validate(&self) -> Result<(), FieldError> {
         within("noisy.position_std_m", self.position_std_m, 0.0, 1e3)?;
         within("noisy.heading_std_deg", self.heading_std_deg, 0.0, 360.0)?;
@@ -151,26 +151,26 @@ impl NoisyPoseConfig {
     }
 }
 
-/// The four kinds of pose error.
+/// Kinds of pose error.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema, clap::ValueEnum)]
 #[serde(rename_all = "snake_case")]
 pub enum NoiseMode {
-    /// One offset, the same for all agents and frames: what the reference code does, which seeds anew at every call.
-    /// There the ego stays exact; give its agent the `recorded` source to repeat that.
+    /// One offset for all agents and frames, as in the reference code, which resets its seed at every call. There the
+    /// ego has no error; give its agent the `recorded` source to reproduce that.
     Fixed,
     /// Drawn anew for every agent and frame.
     #[default]
     Independent,
-    /// First-order autoregressive per agent: it wanders, as a filter's error does.
+    /// First-order autoregressive per agent, as the error of a filter.
     Autoregressive,
-    /// The errors that a pose generator really made, from a table.
+    /// Measured errors of a pose generator, from a table.
     Replayed,
 }
 
-/// Why a pose source cannot be set up.
+/// Error of setting up a pose source.
 #[derive(Debug, thiserror::Error)]
 pub enum PoseSourceError {
-    /// A value is not allowed, or a file is not named.
+    /// A value is out of range, or a file is not named.
     #[error("pose source: {0}")]
     Value(#[from] FieldError),
     /// The table is not readable.
@@ -185,7 +185,7 @@ pub enum PoseSourceError {
 }
 
 impl PoseSourceConfig {
-    /// The name in files and on command lines.
+    /// Name in files and on command lines.
     #[must_use]
     pub fn name(&self) -> &'static str {
         match self {
@@ -197,7 +197,7 @@ impl PoseSourceConfig {
         }
     }
 
-    /// The same for one scenario of many: only tables of poses tell scenarios apart.
+    /// The same for one scenario of many: only tables of poses differ between scenarios.
     #[must_use]
     pub fn for_scenario(&self, name: &str) -> Self {
         match self {
@@ -208,10 +208,10 @@ impl PoseSourceConfig {
         }
     }
 
-    /// Checks the values; files are not looked at.
+    /// Checks the values; files are not opened.
     ///
     /// # Errors
-    /// [`FieldError`] for the first that is not allowed, or a file that is not named.
+    /// [`FieldError`] of the first value that is out of range, or of a file that is not named.
     pub fn validate(&self) -> Result<(), FieldError> {
         let named = |field: &str, option: &str, file: &Path| {
             if !file.as_os_str().is_empty() {
@@ -244,7 +244,7 @@ impl PoseSourceConfig {
         self
     }
 
-    /// The files that poses come from.
+    /// Files that the source reads.
     #[must_use]
     pub fn files(&self) -> Vec<&Path> {
         match self {
@@ -256,13 +256,13 @@ impl PoseSourceConfig {
         }
     }
 
-    /// Whether poses are found in the sweep: without its points there are none.
+    /// True if poses are estimated from the sweep's points.
     #[must_use]
     pub fn looks_at_sweeps(&self) -> bool {
         matches!(self, Self::Pgc(_) | Self::EndToEnd(_))
     }
 
-    /// Sets the source up, files read.
+    /// Sets the source up and reads its files.
     ///
     /// # Errors
     /// [`PoseSourceError`] names the field or the file.
@@ -283,7 +283,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_recorded_pose_passes_unchanged_and_a_missing_one_is_said() {
+    fn the_recorded_pose_passes_unchanged_and_a_missing_one_gives_a_reason() {
         let cav = CavId::new("7").unwrap();
         let cloud = PointCloud::default();
         let pose = Pose::from_xyz_yaw([1.0, 2.0, 3.0], 0.4);

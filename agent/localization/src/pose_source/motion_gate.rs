@@ -1,8 +1,8 @@
-//! Temporal sanity: whether a vehicle can have driven from where it was to where it believes to be.
+//! Motion gate: rejects poses that a vehicle cannot have reached from its previous ones.
 //!
-//! A pose that cannot be reached from the last accepted one is a jump: it is told with a lowered confidence and counted.
-//! When several poses in a row can be reached from each other, they are right and the accepted one was wrong (or the
-//! vehicle was carried): they become the accepted place.
+//! A pose that cannot be reached from the last accepted one is a jump: it is published with a lowered confidence and
+//! counted. When several poses in a row can be reached from each other, they are right and the accepted one was wrong
+//! (or the vehicle was carried): they become the accepted position.
 
 use std::collections::VecDeque;
 
@@ -10,12 +10,12 @@ use nalgebra::Isometry3;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// Accepted poses further back say nothing about the speed now, seconds.
+/// Age up to which accepted poses enter the speed estimate, seconds.
 const SPEED_WINDOW_S: f64 = 1.5;
 /// Shortest time between two poses that a speed is computed from, seconds: below, their errors weigh too much.
 const SPEED_BASE_S: f64 = 0.3;
 
-/// What a vehicle can do.
+/// Motion limits of a vehicle.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct MotionGateConfig {
@@ -25,20 +25,20 @@ pub struct MotionGateConfig {
     pub max_acceleration_mps2: f64,
     /// Largest rate of turn, degrees per second.
     pub max_turn_deg_per_s: f64,
-    /// How far apart two good poses of the same place may lie, metres.
+    /// Largest distance between two good poses of the same place, metres.
     pub position_slack_m: f64,
-    /// The same of their orientation, degrees.
+    /// Largest angle between two good poses of the same place, degrees.
     pub rotation_slack_deg: f64,
-    /// After this long without an accepted pose anything is possible, seconds.
+    /// Time without an accepted pose after which any pose is accepted, seconds.
     pub memory_s: f64,
-    /// Poses in a row that have to agree on a new place.
+    /// Number of poses in a row that have to agree on a new position.
     pub agreeing: usize,
-    /// What the confidence of a jump is multiplied by.
+    /// Factor on the confidence of a jump.
     pub penalty: f64,
 }
 
 impl Default for MotionGateConfig {
-    /// A car, and poses that are right to a metre or so.
+    /// Limits of a car, for poses with errors of about a metre.
     fn default() -> Self {
         Self {
             max_speed_mps: 50.0,
@@ -53,14 +53,14 @@ impl Default for MotionGateConfig {
     }
 }
 
-/// What a pose is, given those before it.
+/// Classification of a pose, given those before it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Verdict {
-    /// It can be reached from the last accepted pose, or there is none.
+    /// The pose can be reached from the last accepted one, or there is none.
     Reachable,
-    /// It cannot.
+    /// The pose cannot be reached.
     Jump,
-    /// It cannot, but it is the last of several that agree with each other: they are accepted now.
+    /// The pose cannot be reached, but it is the last of several that agree with each other: they are accepted now.
     NewPlace,
 }
 
@@ -70,11 +70,11 @@ struct TimedPose {
     world_from_lidar: Isometry3<f64>,
 }
 
-/// Remembers where a vehicle was.
+/// Recent poses of a vehicle.
 #[derive(Debug, Clone)]
 pub struct MotionGate {
     config: MotionGateConfig,
-    /// Accepted poses of the last moments, oldest first.
+    /// Accepted poses of the last seconds, oldest first.
     accepted: VecDeque<TimedPose>,
     /// Jumps in a row that can be reached from each other.
     elsewhere: Vec<TimedPose>,
@@ -82,19 +82,19 @@ pub struct MotionGate {
 }
 
 impl MotionGate {
-    /// Remembers nothing yet.
+    /// Gate without any pose.
     #[must_use]
     pub fn new(config: MotionGateConfig) -> Self {
         Self { config, accepted: VecDeque::new(), elsewhere: Vec::new(), jumps: 0 }
     }
 
-    /// Jumps so far.
+    /// Number of jumps so far.
     #[must_use]
     pub fn jumps(&self) -> u64 {
         self.jumps
     }
 
-    /// What the confidence of a pose with this verdict is multiplied by.
+    /// Factor on the confidence of a pose with this verdict.
     #[must_use]
     pub fn factor(&self, verdict: Verdict) -> f64 {
         match verdict {
@@ -103,12 +103,12 @@ impl MotionGate {
         }
     }
 
-    /// Judges a pose and remembers it.
+    /// Classifies a pose and stores it.
     pub fn judge(&mut self, capture_nanos: u64, world_from_lidar: &Isometry3<f64>) -> Verdict {
         let pose = TimedPose { capture_nanos, world_from_lidar: *world_from_lidar };
         let last = self.accepted.back().copied().filter(|last| self.remembers(last, &pose));
         let Some(last) = last else {
-            // Nothing is known, or the scene began anew.
+            // There is no pose yet, or the scene restarted.
             self.accepted.clear();
             self.accept(pose);
             return Verdict::Reachable;
@@ -141,23 +141,23 @@ impl MotionGate {
         }
     }
 
-    /// Whether a pose is recent enough to judge a later one by.
+    /// True if a pose is recent enough to check a later one against.
     fn remembers(&self, earlier: &TimedPose, later: &TimedPose) -> bool {
         (0.0..=self.config.memory_s).contains(&seconds(earlier, later))
     }
 
-    /// Speed over the last accepted poses, where they tell.
+    /// Speed over the last accepted poses, if they suffice.
     fn speed_mps(&self) -> Option<f64> {
         let (first, last) = (self.accepted.front()?, self.accepted.back()?);
         let time_s = seconds(first, last);
         (time_s >= SPEED_BASE_S).then(|| distance_m(first, last) / time_s)
     }
 
-    /// Whether a vehicle with this speed, or any, can be at `to` after `from`.
+    /// True if a vehicle with this speed, or any, can be at `to` after `from`.
     fn can_reach(&self, from: &TimedPose, to: &TimedPose, speed_mps: Option<f64>) -> bool {
         let config = &self.config;
         let time_s = seconds(from, to);
-        // The speed comes from poses that may be off by the slack, over a second or so.
+        // The speed is computed from poses with errors up to the slack, over a second or so.
         let fastest = speed_mps.map_or(config.max_speed_mps, |speed| {
             speed + config.position_slack_m / SPEED_WINDOW_S + config.max_acceleration_mps2 * time_s
         });
@@ -168,7 +168,7 @@ impl MotionGate {
     }
 }
 
-/// From one pose to another; negative when the other is earlier.
+/// Time from one pose to another; negative if the other is earlier.
 fn seconds(from: &TimedPose, to: &TimedPose) -> f64 {
     (to.capture_nanos as f64 - from.capture_nanos as f64) * 1e-9
 }
@@ -189,7 +189,7 @@ mod tests {
         Isometry3::new(Vector3::new(x, y, 2.0), Vector3::z() * yaw_deg.to_radians())
     }
 
-    /// The verdicts on poses a tenth of a second apart.
+    /// Verdicts on poses a tenth of a second apart.
     fn verdicts(sanity: &mut MotionGate, poses: &[Isometry3<f64>]) -> Vec<Verdict> {
         let capture = |step: usize| step as u64 * TENTH_NANOS;
         poses.iter().enumerate().map(|(step, pose)| sanity.judge(capture(step), pose)).collect()
@@ -198,7 +198,7 @@ mod tests {
     #[test]
     fn a_drive_through_a_bend_is_no_jump() {
         let mut sanity = MotionGate::new(MotionGateConfig::default());
-        // 15 m/s, 30 degrees a second, with poses that shake by half a metre.
+        // 15 m/s, 30 degrees a second, with errors of half a metre.
         let drive: Vec<_> = (0..80)
             .map(|step| {
                 let (time_s, shake) = (f64::from(step) * 0.1, if step % 2 == 0 { 0.5 } else { -0.5 });
@@ -212,7 +212,7 @@ mod tests {
     }
 
     #[test]
-    fn a_jump_is_counted_and_forgotten() {
+    fn a_jump_is_counted_and_not_stored() {
         let mut sanity = MotionGate::new(MotionGateConfig::default());
         let mut drive: Vec<_> = (0..12).map(|step| at(f64::from(step), 0.0, 0.0)).collect();
         drive[6] = at(6.0, 40.0, 0.0);
@@ -227,7 +227,7 @@ mod tests {
     }
 
     #[test]
-    fn poses_that_agree_on_a_new_place_are_believed() {
+    fn poses_that_agree_on_a_new_place_are_accepted() {
         let mut sanity = MotionGate::new(MotionGateConfig::default());
         let mut drive = vec![at(500.0, 0.0, 0.0)];
         drive.extend((0..5).map(|step| at(f64::from(step), 0.0, 0.0)));
@@ -236,7 +236,7 @@ mod tests {
     }
 
     #[test]
-    fn jumps_that_do_not_agree_are_never_believed() {
+    fn jumps_that_do_not_agree_are_never_accepted() {
         let mut sanity = MotionGate::new(MotionGateConfig::default());
         let anywhere = (0..20).map(|step| at(f64::from((step * 7919) % 400), 100.0 + f64::from(step * 60), 0.0));
         let drive: Vec<_> = std::iter::once(at(0.0, 0.0, 0.0)).chain(anywhere).collect();
@@ -245,7 +245,7 @@ mod tests {
     }
 
     #[test]
-    fn a_step_is_judged_by_the_speed_before_it() {
+    fn a_step_is_checked_against_the_speed_before_it() {
         let standing: Vec<_> = (0..10).map(|_| at(0.0, 0.0, 0.0)).collect();
         let mut sanity = MotionGate::new(MotionGateConfig::default());
         verdicts(&mut sanity, &standing);
@@ -254,7 +254,7 @@ mod tests {
     }
 
     #[test]
-    fn a_scene_that_begins_anew_or_a_long_gap_forgets() {
+    fn a_restarted_scene_or_a_long_gap_resets_the_gate() {
         let mut sanity = MotionGate::new(MotionGateConfig::default());
         assert_eq!(sanity.judge(90_000_000_000, &at(0.0, 0.0, 0.0)), Verdict::Reachable);
         assert_eq!(sanity.judge(0, &at(900.0, 0.0, 0.0)), Verdict::Reachable);

@@ -1,4 +1,4 @@
-//! Seeded pose errors that depend on nothing but seed, vehicle and capture time.
+//! Seeded pose errors: functions of seed, vehicle and capture time only.
 
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 use protocol::{CavId, Pose};
@@ -9,7 +9,7 @@ use sha2::{Digest, Sha256};
 
 use super::numpy_normals::NumpyNormals;
 
-/// Random words set aside for one draw; four normals take about eight.
+/// Random words reserved for one draw; four normals take about eight.
 const WORDS_PER_DRAW: u128 = 64;
 
 /// Innovations that have decayed below this share of an error are left out.
@@ -20,7 +20,7 @@ const NEGLIGIBLE: f64 = 1e-3;
 pub struct PlanarError {
     /// x, y, z, metres.
     pub position_m: [f64; 3],
-    /// Heading, radians.
+    /// Heading error, radians.
     pub yaw_rad: f64,
 }
 
@@ -34,14 +34,14 @@ impl PlanarError {
         Isometry3::from_parts(Translation3::from(translation), rotation).into()
     }
 
-    /// The pose with this error seen from the vehicle: x forward, y left.
+    /// The pose with this error in the vehicle's frame: x forward, y left.
     #[must_use]
     pub fn added_in_vehicle(&self, pose: &Pose) -> Pose {
         let error = Isometry3::new(Vector3::from(self.position_m), Vector3::z() * self.yaw_rad);
         (pose.isometry() * error).into()
     }
 
-    /// Distance off, metres.
+    /// Length of the position error, metres.
     #[must_use]
     pub fn distance_m(&self) -> f64 {
         Vector3::from(self.position_m).norm()
@@ -63,8 +63,8 @@ impl PoseNoise {
         Self { position_std_m, yaw_std_rad, seed }
     }
 
-    /// The one error of everyone, always: to the digit what OpenCOOD draws with this seed at every call. Of six normals,
-    /// three are of the position, the fifth of the heading.
+    /// The constant error of all vehicles: to the digit the draw of OpenCOOD with this seed at every call. Of six
+    /// normals, three are of the position, the fifth of the heading.
     #[must_use]
     pub fn fixed(&self) -> PlanarError {
         let mut random = NumpyNormals::new(self.seed);
@@ -81,7 +81,7 @@ impl PoseNoise {
     /// The error of a vehicle at a step of time, correlated by `rho` from one step to the next.
     ///
     /// `e_k = rho e_{k-1} + sqrt(1 - rho^2) n_k`, written out as the sum of the innovations `n` back to where they have
-    /// decayed: so it depends on no earlier call, and frames may be lost, repeated or begun anywhere.
+    /// decayed: so it depends on no earlier call, and frames may be lost, repeated or started anywhere.
     #[must_use]
     pub fn autoregressive(&self, cav: &CavId, step: u64, rho: f64) -> PlanarError {
         let random = self.random(cav);
@@ -149,14 +149,14 @@ mod tests {
     }
 
     #[test]
-    fn the_fixed_error_is_everyones() {
+    fn the_fixed_error_is_the_same_for_all() {
         let noise = PoseNoise::new(0.2, 0.01, 25);
         assert_eq!(noise.fixed(), noise.fixed());
         assert_ne!(noise.fixed(), PoseNoise::new(0.2, 0.01, 26).fixed());
     }
 
     #[test]
-    fn independent_errors_have_the_asked_spread_and_no_memory() {
+    fn independent_errors_have_the_configured_spread_and_no_correlation() {
         let noise = PoseNoise::new(0.5, 0.02, 1);
         let x = |step| noise.independent(&cav("a"), step).position_m[0];
         let (correlation, spread) = correlation((0..4000).map(|step| (x(step), x(step + 1))));
@@ -165,7 +165,7 @@ mod tests {
     }
 
     #[test]
-    fn autoregressive_errors_remember_by_rho() {
+    fn autoregressive_errors_are_correlated_by_rho() {
         let noise = PoseNoise::new(0.5, 0.02, 1);
         let x = |step| noise.autoregressive(&cav("a"), step, 0.9).position_m[0];
         let (correlation, spread) = correlation((0..4000).map(|step| (x(step), x(step + 1))));

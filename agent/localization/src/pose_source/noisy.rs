@@ -1,4 +1,4 @@
-//! The measured pose with an error.
+//! Pose source that adds an error to the measured pose.
 
 use std::path::Path;
 
@@ -10,9 +10,9 @@ use super::{NO_SOURCE, NoiseMode, NoisyPoseConfig, PoseInput, PoseSource, PoseSo
 
 /// The measured pose with an error of one of four kinds.
 ///
-/// The error depends on seed, vehicle and capture time alone, so a live run and an offline one see the same poses, and
-/// so does a run that lost frames. The confidence of a drawn error is `1 / (1 + e^2)` of its length in metres, as
-/// Eq. 6 of the paper has it and as its experiments do on recorded data; a replayed error brings its own.
+/// The error depends on seed, vehicle and capture time alone, so a live run and an offline one get the same poses, and
+/// so does a run that lost frames. The confidence of a drawn error is `1 / (1 + e^2)` of its length in metres, as in
+/// Eq. 6 of the paper and in its experiments on recorded data; a replayed error has a confidence of its own.
 #[derive(Debug, Clone)]
 pub struct NoisyPose {
     seed: u64,
@@ -58,7 +58,7 @@ impl NoisyPose {
         PoseEstimate::new(error.added_in_world(pose), confidence(&error))
     }
 
-    /// Vehicles start at different rows of the table, so that they do not err alike.
+    /// Vehicles start at different rows of the table, so that their errors differ.
     fn first_row(&self, cav: &CavId) -> u64 {
         let key = noise::key(self.seed, cav);
         u64::from_le_bytes(std::array::from_fn(|byte| key[byte]))
@@ -81,7 +81,7 @@ fn replayed(row: TableRow, pose: &Pose) -> PoseEstimate {
     }
 }
 
-/// Correlation of an error with the one a step before.
+/// Correlation of an error with that of the previous step.
 fn correlation(config: &NoisyPoseConfig) -> f64 {
     if config.decay_s > 0.0 { (-config.step_s / config.decay_s).exp() } else { 0.0 }
 }
@@ -147,7 +147,7 @@ mod tests {
     }
 
     #[test]
-    fn numbers_that_make_no_sense_are_named() {
+    fn invalid_numbers_are_named() {
         let config = NoisyPoseConfig { position_std_m: f64::NAN, ..NoisyPoseConfig::default() };
         let message = NoisyPose::new(&config).unwrap_err().to_string();
         assert!(message.contains("position_std_m is NaN"), "{message}");

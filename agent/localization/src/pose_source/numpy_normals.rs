@@ -1,21 +1,21 @@
-//! The normal numbers of NumPy's legacy generator, which reference code seeds anew at every call: only the same
-//! generator gives the same offsets.
+//! Normal numbers of NumPy's legacy generator, which reference code seeds at every call: only the same generator gives
+//! the same offsets.
 
 /// Words of state of the Mersenne Twister MT19937 (Matsumoto and Nishimura 1998).
 const WORDS: usize = 624;
 /// Distance of the word that each one is mixed with.
 const SHIFT: usize = 397;
 
-/// `numpy.random.RandomState(seed)`, as far as `normal` needs it.
+/// `numpy.random.RandomState(seed)`, the part that `normal` needs.
 pub(super) struct NumpyNormals {
     words: [u32; WORDS],
     next: usize,
-    /// The polar method makes two at a time.
+    /// Second of the two numbers that the polar method draws at a time.
     second: Option<f64>,
 }
 
 impl NumpyNormals {
-    /// Seeded with the lower 32 bits of `seed`, as NumPy does with a whole number.
+    /// Seeded with the lower 32 bits of `seed`, as NumPy does with an integer.
     pub(super) fn new(seed: u64) -> Self {
         let mut words = [0; WORDS];
         words[0] = seed as u32;

@@ -1,4 +1,4 @@
-//! Options of a command line that choose a pose source and set it up.
+//! Command-line options that choose and configure a pose source.
 
 use clap::{ArgMatches, Args, Command, FromArgMatches, ValueEnum};
 use protocol::config::{document, options_of};
@@ -8,7 +8,7 @@ use super::{CachedPoseConfig, EndToEndPoseConfig, NoisyPoseConfig, PgcConfig, Po
 /// Option that chooses the source.
 #[derive(Debug, clap::Args)]
 struct Choice {
-    /// Where the vehicle takes its pose from [default: recorded].
+    /// Source of the vehicle's pose [default: recorded].
     #[arg(long, value_enum)]
     pose_source: Option<Kind>,
 }
@@ -17,15 +17,15 @@ struct Choice {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 #[value(rename_all = "snake_case")]
 enum Kind {
-    /// The recording's own pose.
+    /// The recorded pose.
     Recorded,
-    /// That pose with an error.
+    /// The recorded pose with an error.
     Noisy,
-    /// From the LiDAR sweep alone, by PGC.
+    /// Estimated from the LiDAR sweep alone, by PGC.
     Pgc,
-    /// The same by a network that was trained end to end, to compare with.
+    /// Estimated from the LiDAR sweep alone, by a network that was trained end to end.
     EndToEnd,
-    /// From a table that `agent localize` wrote.
+    /// Read from a table that `agent localize` wrote.
     Cached,
 }
 
@@ -58,10 +58,10 @@ impl FromArgMatches for PoseSourceConfig {
         Ok(source)
     }
 
-    /// Options of sources that are not chosen are not looked at.
+    /// Options of sources that are not chosen are ignored.
     fn update_from_arg_matches(&mut self, matches: &ArgMatches) -> Result<(), clap::Error> {
-        let asked = Choice::from_arg_matches(matches)?.pose_source;
-        if let Some(kind) = asked.filter(|kind| *kind != self.kind()) {
+        let requested = Choice::from_arg_matches(matches)?.pose_source;
+        if let Some(kind) = requested.filter(|kind| *kind != self.kind()) {
             *self = Self::new(kind);
         }
         match self {

@@ -1,4 +1,4 @@
-//! Poses that were found once, one row per sweep, on disk and by name.
+//! Table of poses on disk, one row per sweep, found by scenario, vehicle and capture time.
 
 use std::collections::HashMap;
 use std::fs::OpenOptions;
@@ -15,7 +15,7 @@ const HEADER: &str = "scenario,cav,capture_nanos,x_m,y_m,z_m,qw,qx,qy,qz,confide
 /// Largest file that is read, bytes: two million sweeps.
 const MAX_BYTES: u64 = 256 << 20;
 
-/// Why a table of poses cannot be read or written.
+/// Error of reading or writing a table of poses.
 #[derive(Debug, thiserror::Error)]
 pub enum PoseTableError {
     /// The file or a row of it cannot be used.
@@ -24,25 +24,25 @@ pub enum PoseTableError {
     /// The file cannot be written.
     #[error("{}: {source}", path.display())]
     Write {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// The system's reason.
+        /// Error of the operating system.
         source: io::Error,
     },
-    /// A scenario that was asked for has no row.
+    /// The requested scenario has no row.
     #[error("{}: there is no pose of scenario {scenario} in it", path.display())]
     NoScenario {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// The scenario.
+        /// Name of the scenario.
         scenario: String,
     },
-    /// Which of several scenarios is meant is not said.
-    #[error("{}: it has poses of {count} scenarios, and `scenario` does not say of which", path.display())]
+    /// The table has several scenarios and none is selected.
+    #[error("{}: it has poses of {count} scenarios, `scenario` must name one", path.display())]
     WhichScenario {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// How many there are.
+        /// Number of scenarios.
         count: usize,
     },
 }
@@ -50,24 +50,24 @@ pub enum PoseTableError {
 /// A sweep within its scenario.
 type SweepKey = (CavId, u64);
 
-/// Poses of scenarios, sweep by sweep; a sweep without a pose says why.
+/// Poses of scenarios, sweep by sweep; a sweep without a pose has a reason.
 ///
 /// The file is text: a header, then per sweep the last part of the scenario's name, vehicle, capture time, translation,
-/// quaternion and confidence, or the reason for no pose and the correspondences that agreed.
+/// quaternion and confidence, or the reason for no pose and the number of inliers.
 #[derive(Debug, Clone, Default)]
 pub struct PoseTable {
     path: PathBuf,
     scenarios: HashMap<String, HashMap<SweepKey, PoseEstimate>>,
 }
 
-/// One row on its way to a file.
+/// One row to write.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PoseRow<'a> {
-    /// Whose sweep.
+    /// Vehicle.
     pub cav: &'a CavId,
-    /// When, nanoseconds.
+    /// Capture time, nanoseconds.
     pub capture_nanos: u64,
-    /// Where, or why nobody knows.
+    /// Pose, or the reason why there is none.
     pub estimate: PoseEstimate,
 }
 
@@ -82,13 +82,13 @@ impl PoseTable {
             let row = row.complete()?;
             let of_scenario = table.scenarios.entry(row.field(0).to_owned()).or_default();
             if of_scenario.insert(sweep_key(&row)?, estimate(&row)?).is_some() {
-                return Err(row.fault("the sweep has a row already").into());
+                return Err(row.fault("duplicate row of the sweep").into());
             }
         }
         Ok(table)
     }
 
-    /// Whether there are poses of a scenario, by its name or the path that ends in it.
+    /// True if there are poses of a scenario, by its name or the path that ends in it.
     #[must_use]
     pub fn has(&self, scenario: &str) -> bool {
         self.scenarios.contains_key(last_part(scenario))
@@ -100,13 +100,13 @@ impl PoseTable {
         self.scenarios.values().map(HashMap::len).sum()
     }
 
-    /// Whether there is no row.
+    /// True if there is no row.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.scenarios.is_empty()
     }
 
-    /// What is known of a sweep.
+    /// Estimate of a sweep.
     #[must_use]
     pub fn get(&self, scenario: &str, cav: &CavId, capture_nanos: u64) -> Option<&PoseEstimate> {
         self.scenarios.get(last_part(scenario))?.get(&(cav.clone(), capture_nanos))
@@ -124,10 +124,10 @@ impl PoseTable {
         append(path).map_err(|source| PoseTableError::Write { path: path.to_owned(), source })
     }
 
-    /// The poses of one scenario: the one asked for, or the only one there is.
+    /// The poses of one scenario: the requested one, or the only one there is.
     ///
     /// # Errors
-    /// [`PoseTableError`] when there is none, or several and none is asked for.
+    /// [`PoseTableError`] when there is none, or several and none is requested.
     fn of_scenario(mut self, scenario: Option<&str>) -> Result<HashMap<SweepKey, PoseEstimate>, PoseTableError> {
         let path = self.path.clone();
         match scenario {
@@ -141,20 +141,20 @@ impl PoseTable {
     }
 }
 
-/// Which table, and of which scenario.
+/// Table of poses and the scenario in it.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema, clap::Args)]
 #[serde(deny_unknown_fields)]
 pub struct CachedPoseConfig {
     /// Table of poses, as `agent localize` writes it (pose source cached).
     #[arg(id = "poses", long = "poses", value_name = "FILE")]
     pub file: PathBuf,
-    /// Scenario that is replayed; needed where the table has several.
+    /// Scenario that is replayed; required if the table has several.
     #[arg(skip)]
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub scenario: Option<String>,
 }
 
-/// Looks poses up that were found before.
+/// Looks up poses that were estimated before.
 #[derive(Debug, Clone)]
 pub struct CachedPose {
     poses: HashMap<SweepKey, PoseEstimate>,
@@ -171,13 +171,13 @@ impl CachedPose {
 }
 
 impl super::PoseSource for CachedPose {
-    /// Looks at neither sweep nor measured pose; a sweep that is not in the table has no source.
+    /// Ignores sweep and measured pose; a sweep that is not in the table has no source.
     fn estimate(&mut self, input: &super::PoseInput<'_>) -> PoseEstimate {
         self.poses.get(&(input.cav.clone(), input.capture_nanos)).copied().unwrap_or(super::NO_SOURCE)
     }
 }
 
-/// Scenarios are known by the folder they lie in, wherever that folder lies.
+/// Scenarios are identified by the name of their folder, wherever that folder lies.
 fn last_part(scenario: &str) -> &str {
     scenario.rsplit('/').next().unwrap_or(scenario)
 }
@@ -203,7 +203,7 @@ fn fields(scenario: &str, row: &PoseRow<'_>) -> [String; 13] {
 
 fn sweep_key(row: &CsvRow<'_>) -> Result<SweepKey, CsvError> {
     let cav = CavId::new(row.field(1)).map_err(|error| row.fault(format_args!("cav: {error}")))?;
-    Ok((cav, row.field(2).parse().map_err(|_| row.wrong(2, "whole nanoseconds"))?))
+    Ok((cav, row.field(2).parse().map_err(|_| row.wrong(2, "integer nanoseconds"))?))
 }
 
 fn estimate(row: &CsvRow<'_>) -> Result<PoseEstimate, CsvError> {
@@ -275,13 +275,13 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wrong_is_named_with_file_and_line() {
+    fn errors_name_file_and_line() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("poses.csv");
         let good = "s,a,1,0,0,0,1,0,0,0,0.5,,";
         for (text, part) in [
             ("a,b\n".to_owned(), "poses.csv:1"),
-            (format!("{HEADER}\n{good}\n{good}\n"), "poses.csv:3: the sweep has a row already"),
+            (format!("{HEADER}\n{good}\n{good}\n"), "poses.csv:3: duplicate row of the sweep"),
             (format!("{HEADER}\ns,a,1,0\n"), "4 columns"),
             (format!("{HEADER}\ns,a,1,0,0,0,1,0,0,0,1.5,,\n"), "confidence is \"1.5\", must be 0 to 1"),
             (format!("{HEADER}\ns,a,1,0,0,NaN,1,0,0,0,0.5,,\n"), "poses.csv:2"),

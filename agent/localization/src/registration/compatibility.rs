@@ -1,6 +1,6 @@
 //! Square matrices over correspondences: distances, sets of bits, leading eigenvectors.
 
-/// Products that are summed up side by side.
+/// Products that are summed in parallel.
 const LANES: usize = 16;
 
 /// Distances between all points, row by row, in single precision.
@@ -33,7 +33,7 @@ impl Bits {
         Self { words, words_per_row: size.div_ceil(64) }
     }
 
-    /// How many bits two rows share; for a symmetric matrix an entry of its square.
+    /// Number of bits that two rows share; for a symmetric matrix an entry of its square.
     pub(super) fn common(&self, a: usize, b: usize) -> u32 {
         let row = |index: usize| &self.words[index * self.words_per_row..(index + 1) * self.words_per_row];
         row(a).iter().zip(row(b)).map(|(a, b)| (a & b).count_ones()).sum()
@@ -41,7 +41,7 @@ impl Bits {
 }
 
 /// Leading eigenvectors of symmetric `size` by `size` matrices, one after the other, of length one, by power iteration
-/// from a vector of ones. All matrices take the same number of steps: it ends when all stand still.
+/// from a vector of ones. All matrices take the same number of steps: it ends when all have converged.
 pub(super) fn leading_eigenvectors(matrices: &[f32], size: usize, iterations: usize) -> Vec<f32> {
     let mut vectors = vec![1.0_f32; matrices.len() / size.max(1)];
     for _ in 0..iterations {

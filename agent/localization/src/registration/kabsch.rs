@@ -1,13 +1,13 @@
-//! The rigid motion that fits weighted pairs best (Kabsch 1976, with the determinant kept at +1).
+//! Kabsch's algorithm: the rigid motion that fits weighted pairs best (Kabsch 1976, with the determinant kept at +1).
 
 use nalgebra::{Isometry3, Matrix3, Rotation3, SVD, Translation3, UnitQuaternion, Vector3};
 
-/// Below this ratio of the second to the first singular value the pairs lie on a line, and any turn about it fits.
+/// Ratio of the second to the first singular value below which the pairs lie on a line, and any rotation about it fits.
 const COLLINEAR: f64 = 1e-9;
-/// Iterations that the 3x3 decomposition may take; it needs about ten.
+/// Largest number of iterations of the 3x3 decomposition; it needs about ten.
 const MAX_SVD_ITERATIONS: usize = 200;
 
-/// Why pairs do not fix a rigid motion.
+/// Reason why pairs do not constrain a rigid motion.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 pub enum Degenerate {
     /// No pair has a positive weight.
@@ -50,13 +50,13 @@ impl PairMoments {
     /// `target_from_source` with the least weighted sum of squared residuals.
     ///
     /// # Errors
-    /// [`Degenerate`] when the pairs do not fix it.
+    /// [`Degenerate`] when the pairs do not constrain it.
     pub fn fit(&self) -> Result<Isometry3<f64>, Degenerate> {
         self.fit_biased(0.0)
     }
 
-    /// The same with `epsilon` added to the sum of weights that the centroids are divided by, as implementations do that
-    /// guard themselves against a division by zero; it draws both centroids towards their origins.
+    /// The same with `epsilon` added to the sum of weights that the centroids are divided by, as in implementations
+    /// that guard against a division by zero; it pulls both centroids towards their origins.
     ///
     /// # Errors
     /// See [`Self::fit`].
@@ -91,14 +91,14 @@ fn rotation_of(covariance: &Matrix3<f64>) -> Result<Rotation3<f64>, Degenerate> 
     order.sort_by(|&a, &b| svd.singular_values[b].total_cmp(&svd.singular_values[a]));
     let [first, second, last] = order;
     let ratio = svd.singular_values[second] / svd.singular_values[first];
-    // 0 / 0 where all points are one.
+    // 0 / 0 if all points coincide.
     let ratio = if ratio.is_nan() { 0.0 } else { ratio };
     if ratio <= COLLINEAR {
         return Err(Degenerate::Collinear(ratio));
     }
     let mut v = v_t.transpose();
     if (v * u.transpose()).determinant() < 0.0 {
-        // The best orthogonal map mirrors: turning its weakest axis round gives the best rotation.
+        // The best orthogonal matrix is a reflection: negating its weakest axis gives the best rotation.
         v.column_mut(last).neg_mut();
     }
     Ok(Rotation3::from_matrix_unchecked(v * u.transpose()))
@@ -156,7 +156,7 @@ mod tests {
     }
 
     #[test]
-    fn a_mirror_image_gives_a_rotation_all_the_same() {
+    fn a_mirror_image_still_gives_a_rotation() {
         let box_corners = (0..8).map(|corner| {
             let side = |bit: usize, reach: f64| if corner >> bit & 1 == 0 { -reach } else { reach };
             Vector3::new(side(0, 4.0), side(1, 2.0), side(2, 1.0))
@@ -164,7 +164,7 @@ mod tests {
         let pairs: Vec<_> = box_corners.map(|p| (p, Vector3::new(p.x, p.y, -p.z), 1.0)).collect();
         let motion = fit(&pairs).unwrap();
         assert!((motion.rotation.to_rotation_matrix().matrix().determinant() - 1.0).abs() < 1e-12);
-        // Turning nothing is best: the mirrored axis is the shortest.
+        // The identity is best: the mirrored axis is the shortest.
         assert!(motion.rotation.angle() < 1e-9, "{}", motion.rotation.angle());
     }
 
@@ -180,7 +180,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_pair_is_said() {
+    fn invalid_pairs_are_an_error() {
         let [a, b, c, _] = corners();
         assert_eq!(fit(&[]), Err(Degenerate::NoWeight(0.0)));
         assert_eq!(fit(&[(a, a, 0.0), (b, b, 0.0)]), Err(Degenerate::NoWeight(0.0)));
@@ -189,7 +189,7 @@ mod tests {
     }
 
     #[test]
-    fn weights_decide_whom_to_believe() {
+    fn pairs_count_by_their_weights() {
         let shifted = corners().map(|p| (p, p + Vector3::x(), 1.0));
         let elsewhere = corners().map(|p| (p, p - Vector3::x() * 5.0, 1e-9));
         let motion = fit(&[shifted, elsewhere].concat()).unwrap();

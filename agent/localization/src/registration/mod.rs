@@ -1,9 +1,9 @@
-//! Rigid registration of correspondences: where is the sensor, given points it measured and where they are in the world.
+//! Rigid registration of correspondences: pose of the sensor from points it measured and their positions in the world.
 //!
 //! Clouds against clouds without correspondences: [`icp`].
 //!
-//! Pure geometry: [`ransac`] and [`sc2pcr`] find the motion among outliers, [`kabsch`] fits it to pairs that are right and
-//! [`refine`] sharpens it. All of them answer with a [`Registration`] or say why there is none.
+//! Pure geometry: [`ransac`] and [`sc2pcr`] find the motion among outliers, [`kabsch`] fits it to inliers and
+//! [`refine`] refines it. Each returns a [`Registration`] or the reason why there is none.
 //!
 //! ```
 //! use localization::registration::{Correspondence, ransac};
@@ -32,29 +32,29 @@ use nalgebra::{Isometry3, Point3, Vector3};
 
 use kabsch::Degenerate;
 
-/// Coordinates beyond this are no places but errors, metres.
+/// Largest valid coordinate, metres: larger ones are errors.
 const MAX_ABS_M: f32 = 1e7;
 
-/// A point as the sensor measured it, and where it is believed to be.
+/// A measured point and its predicted position in the target frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Correspondence {
     /// In the source frame, the sensor's: metres.
     pub source_m: [f32; 3],
     /// In the target frame, the world's: metres.
     pub target_m: [f32; 3],
-    /// How far to trust it, above 0; only ratios matter. Zero, negative and not finite weights take no part.
+    /// Weight above 0; only ratios matter. Pairs with zero, negative or non-finite weights are ignored.
     pub weight: f32,
 }
 
 impl Correspondence {
-    /// Whether it can take part: finite places and a positive finite weight.
+    /// True if it can be used: finite coordinates and a positive finite weight.
     #[must_use]
     pub fn usable(&self) -> bool {
         let bounded = |point: &[f32; 3]| point.iter().all(|coordinate| coordinate.abs() <= MAX_ABS_M);
         self.weight > 0.0 && self.weight.is_finite() && bounded(&self.source_m) && bounded(&self.target_m)
     }
 
-    /// Distance between the target and the moved source, metres.
+    /// Distance between the target and the transformed source, metres.
     #[must_use]
     pub fn residual_m(&self, target_from_source: &Isometry3<f64>) -> f64 {
         let moved = target_from_source * Point3::from(self.source_m.map(f64::from));
@@ -62,21 +62,21 @@ impl Correspondence {
     }
 }
 
-/// The motion that correspondences agree on.
+/// A motion with its inliers.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Registration {
-    /// Takes points of the source frame to the target frame.
+    /// Transforms points of the source frame to the target frame.
     pub target_from_source: Isometry3<f64>,
-    /// Places of the agreeing correspondences in the list that was given, ascending.
+    /// Indices of the inliers in the given list, ascending.
     pub inliers: Vec<u32>,
-    /// Share of the given correspondences that agree.
+    /// Inliers as a share of the given correspondences, 0..=1.
     pub inlier_ratio: f64,
     /// Root mean square of the inliers' residuals, metres.
     pub rms_m: f64,
 }
 
 impl Registration {
-    /// Counts who agrees with a motion within `threshold_m`.
+    /// Counts the inliers of a motion within `threshold_m`.
     #[must_use]
     pub fn judge(pairs: &[Correspondence], target_from_source: Isometry3<f64>, threshold_m: f64) -> Self {
         let mut inliers = Vec::new();
@@ -93,7 +93,7 @@ impl Registration {
         Self { target_from_source, inliers, inlier_ratio, rms_m: (squares / count).sqrt() }
     }
 
-    /// Itself if at least `required` correspondences agree.
+    /// Itself if there are at least `required` inliers.
     fn with_at_least(self, required: usize, given: usize) -> Result<Self, NoRegistration> {
         if self.inliers.len() < required {
             return Err(NoRegistration::TooFewInliers { found: self.inliers.len(), required, given });
@@ -102,41 +102,41 @@ impl Registration {
     }
 }
 
-/// Why correspondences give no motion.
+/// Reason why correspondences give no motion.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum NoRegistration {
     /// There is too little to start from.
     #[error("{usable} of {given} correspondences are usable, at least {required} are needed")]
     TooFewCorrespondences {
-        /// With finite places and a positive weight.
+        /// Number with finite coordinates and a positive weight.
         usable: usize,
-        /// All.
+        /// Number of all correspondences.
         given: usize,
-        /// What it takes.
+        /// Number required.
         required: usize,
     },
-    /// Too few agree on any motion.
+    /// Too few are inliers of any motion.
     #[error("at most {found} of {given} correspondences agree on one motion, at least {required} must")]
     TooFewInliers {
-        /// Largest number that agreed.
+        /// Largest number of inliers.
         found: usize,
-        /// What it takes.
+        /// Number required.
         required: usize,
-        /// All.
+        /// Number of all correspondences.
         given: usize,
     },
-    /// Those that agree do not fix the motion.
-    #[error("{inliers} agreeing correspondences do not fix a motion: {reason}")]
+    /// The inliers do not constrain the motion.
+    #[error("{inliers} inliers do not constrain a motion: {reason}")]
     Degenerate {
-        /// How many agreed.
+        /// Number of inliers.
         inliers: usize,
-        /// What is wrong with them.
+        /// Reason of the fit.
         reason: Degenerate,
     },
 }
 
 impl NoRegistration {
-    /// The largest number of correspondences that agreed.
+    /// The largest number of inliers.
     #[must_use]
     pub fn inlier_count(&self) -> usize {
         match self {
@@ -147,7 +147,7 @@ impl NoRegistration {
     }
 }
 
-/// `Err` when fewer than `required` can take part.
+/// `Err` when fewer than `required` are usable.
 fn check_enough(pairs: &[Correspondence], required: usize) -> Result<(), NoRegistration> {
     let usable = pairs.iter().filter(|pair| pair.usable()).count();
     if usable < required {

@@ -1,4 +1,4 @@
-//! Correspondences laid out for scoring many motions quickly.
+//! Memory layout of correspondences for fast scoring of many motions.
 
 use nalgebra::{Isometry3, Matrix3, Vector3};
 use rand::seq::SliceRandom;
@@ -6,44 +6,44 @@ use rand_chacha::ChaCha8Rng;
 
 use super::Correspondence;
 
-/// Pairs that are scored in one go; a multiple of what vector units hold.
+/// Number of pairs that are scored at once; a multiple of the width of vector units.
 const LANES: usize = 16;
-/// Pairs that are scored before a motion may be given up, in blocks of [`LANES`].
+/// Number of pairs that are scored before a motion may be discarded, in blocks of [`LANES`].
 const PREFIX_BLOCKS: usize = 24;
 
 /// One coordinate or weight of all pairs, padded with zeros to whole blocks.
 type Column = Vec<[f32; LANES]>;
 
-/// How well a motion fits: a truncated quadratic (MSAC) turned round, so that more is better.
+/// Score of a motion: a truncated quadratic (MSAC) with the sign reversed, so that more is better.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct Gain {
-    /// Of the first, most trusted pairs.
+    /// Score over the first pairs, those of the highest weights.
     pub prefix: f32,
-    /// Of all pairs.
+    /// Score over all pairs.
     pub total: f32,
 }
 
 impl Gain {
-    /// Whether a motion with this prefix is not worth scoring further when `self` is the best so far. A motion as good as
-    /// the best, scored on a few hundred pairs, is as good as never half as good there.
+    /// True if a motion with this prefix is not worth scoring further when `self` is the best so far. Over a few
+    /// hundred pairs, a motion as good as the best practically never scores less than half of it.
     fn rules_out(&self, prefix: f32) -> bool {
         prefix < 0.5 * self.prefix
     }
 }
 
-/// Usable correspondences, most trusted first, column by column.
+/// Usable correspondences, highest weights first, column by column.
 #[derive(Debug)]
 pub(super) struct Pairs {
     source: [Column; 3],
     target: [Column; 3],
     weight: Column,
     count: usize,
-    /// Subtracted from all targets, so that `f32` is fine anywhere on earth.
+    /// Subtracted from all targets, so that `f32` is precise enough anywhere on earth, metres.
     origin: Vector3<f64>,
 }
 
 impl Pairs {
-    /// Takes the usable ones; pairs of equal weight in random order, so that a prefix of them is a fair sample.
+    /// Stores the usable ones; pairs of equal weight in random order, so that a prefix of them is a fair sample.
     pub(super) fn new(pairs: &[Correspondence], random: &mut ChaCha8Rng) -> Self {
         let mut usable: Vec<&Correspondence> = pairs.iter().filter(|pair| pair.usable()).collect();
         usable.shuffle(random);
@@ -70,7 +70,7 @@ impl Pairs {
         self.count
     }
 
-    /// A motion of this layout as one between the frames of the caller.
+    /// Converts a motion of this layout to the frames of the caller.
     pub(super) fn to_target_frame(&self, motion: &Isometry3<f64>) -> Isometry3<f64> {
         let mut moved = *motion;
         moved.translation.vector += self.origin;
@@ -87,7 +87,7 @@ impl Pairs {
         Vector3::from(std::array::from_fn::<_, 3, _>(|axis| f64::from(self.target[axis][block][lane])))
     }
 
-    /// Source, target and weight of the pairs within `radius_m` of where `motion` takes them.
+    /// Source, target and weight of the pairs within `radius_m` of their positions under `motion`.
     pub(super) fn near(&self, motion: &Isometry3<f64>, radius_m: f64) -> Vec<(Vector3<f64>, Vector3<f64>, f64)> {
         let model = Model::new(motion);
         let limit = (radius_m * radius_m) as f32;
@@ -104,7 +104,7 @@ impl Pairs {
         near
     }
 
-    /// Scores a motion, or gives up on it when `best` is clearly better.
+    /// Score of a motion, or `None` as soon as `best` is clearly better.
     pub(super) fn gain(&self, motion: &Isometry3<f64>, threshold_m: f64, best: &Gain) -> Option<Gain> {
         let model = Model::new(motion);
         let scale = (1.0 / (threshold_m * threshold_m)) as f32;
@@ -125,7 +125,7 @@ impl Pairs {
             let weight = &self.weight[block];
             for lane in 0..LANES {
                 let gain = 1.0 - squared[lane] * scale;
-                // Not `max`, which would have to mind NaN: there is none here, and this is one instruction.
+                // Not `max`, which would have to handle NaN: there is none here, and this is one instruction.
                 sums[lane] += weight[lane] * if gain > 0.0 { gain } else { 0.0 };
             }
         }
@@ -189,7 +189,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_unusable_takes_no_part() {
+    fn unusable_pairs_are_ignored() {
         let good = Correspondence { source_m: [0.0; 3], target_m: [1.0; 3], weight: 0.5 };
         let bad = [f32::NAN, f32::INFINITY, 1e30].map(|x| Correspondence { source_m: [x, 0.0, 0.0], ..good });
         let heavy = [f32::NAN, f32::INFINITY, 0.0, -1.0].map(|weight| Correspondence { weight, ..good });

@@ -1,8 +1,9 @@
 //! Random sample consensus with local optimisation (Fischler and Bolles 1981; Chum, Matas and Kittler 2003).
 //!
-//! Minimal samples are drawn mostly from trusted correspondences, tested for consistent edges before anything is solved,
-//! scored by a truncated quadratic (MSAC) that gives up early, and every new best is optimised locally. Drawing ends as
-//! soon as a better motion would have been drawn with the confidence asked for. Same input and seed, same answer.
+//! Minimal samples are drawn mostly from correspondences of high weight and tested for consistent edges before anything
+//! is solved; motions are scored by a truncated quadratic (MSAC) with early termination, and every new best is
+//! optimised locally. Drawing ends as soon as a better motion would have been drawn with the required confidence. Same
+//! input and seed, same result.
 
 use nalgebra::{Isometry3, Vector3};
 use rand::SeedableRng;
@@ -15,17 +16,17 @@ use super::{Correspondence, NoRegistration, Registration, check_enough, refine};
 
 /// Scales of the local optimisation, in thresholds: wide enough for a motion from few noisy points.
 const LOCAL_SCALES: [f64; 3] = [2.0, 1.2, 0.8];
-/// Steps of the final refinement, at most.
+/// Largest number of steps of the final refinement.
 const FINAL_STEPS: usize = 20;
-/// Share of all-inlier samples that are assumed to lead to the motion: half of the draws ignore the weights, and samples
+/// Share of all-inlier samples that are assumed to give the motion: half of the draws ignore the weights, and samples
 /// may be too close together or too noisy.
 const SAMPLE_YIELD: f64 = 0.25;
 
-/// How a motion is computed from a sample.
+/// Minimal solver: computes a motion from a sample.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum MinimalSolver {
-    /// From two points: heading and position of a vehicle that stands upright; its tilt is found afterwards.
+    /// From two points: heading and position of an upright vehicle; its tilt is estimated afterwards.
     #[default]
     UprightTwoPoint,
     /// From three points: any rotation.
@@ -46,11 +47,11 @@ pub struct RansacConfig {
     pub min_edge_m: f64,
     /// Fewest inliers of a result.
     pub min_inliers: usize,
-    /// Probability with which the best motion is found before drawing stops.
+    /// Probability with which the best motion is found before drawing stops, 0..1.
     pub confidence: f64,
-    /// Fewest draws.
+    /// Smallest number of draws.
     pub min_draws: u32,
-    /// Most draws.
+    /// Largest number of draws.
     pub max_draws: u32,
     /// Scale of the final refinement, metres: about the residual of good inliers.
     pub refine_scale_m: f64,
@@ -59,7 +60,7 @@ pub struct RansacConfig {
 }
 
 impl Default for RansacConfig {
-    /// For the sweeps of vehicles and scene coordinates that are right to a metre or two.
+    /// For the sweeps of vehicles and scene coordinates with errors of a metre or two.
     fn default() -> Self {
         Self {
             inlier_threshold_m: 1.5,
@@ -91,7 +92,7 @@ impl RansacConfig {
         }
     }
 
-    /// The same for correspondences that may be off by `factor` times as much.
+    /// The same for correspondences with `factor` times the error.
     #[must_use]
     pub fn wider(&self, factor: f64) -> Self {
         Self {
@@ -112,7 +113,7 @@ impl RansacConfig {
     fn sample_test(&self) -> SampleTest {
         SampleTest {
             min_edge_m: self.min_edge_m,
-            // Both ends of an edge may be off by a threshold.
+            // Both ends of an edge may have an error of a threshold.
             edge_tolerance_m: 2.0 * self.inlier_threshold_m,
             max_tilt_rad: self.max_tilt_deg.to_radians(),
         }
@@ -123,7 +124,7 @@ impl RansacConfig {
         up.z >= self.max_tilt_deg.to_radians().cos()
     }
 
-    /// Draws after which a motion that `inliers` of `count` agree on would have been found.
+    /// Number of draws after which a motion with `inliers` of `count` would have been found.
     fn draws_needed(&self, inliers: usize, count: usize) -> u32 {
         let ratio = inliers as f64 / count.max(1) as f64;
         let hit = (SAMPLE_YIELD * ratio.powi(self.sample_size())).clamp(1e-12, 1.0 - 1e-12);
@@ -132,10 +133,10 @@ impl RansacConfig {
     }
 }
 
-/// Finds the motion that most correspondences agree on.
+/// Finds the motion with the most inliers.
 ///
 /// # Errors
-/// [`NoRegistration`] when there are too few correspondences or too few of them agree.
+/// [`NoRegistration`] when there are too few correspondences or too few inliers.
 pub fn solve(correspondences: &[Correspondence], config: &RansacConfig) -> Result<Registration, NoRegistration> {
     let required = config.min_inliers.max(3);
     check_enough(correspondences, required)?;
@@ -165,7 +166,7 @@ struct Search<'a> {
 impl Search<'_> {
     fn run(mut self, random: &mut ChaCha8Rng) -> Option<Isometry3<f64>> {
         let test = self.config.sample_test();
-        // The best gain of a motion as drawn, before any optimisation: what the next draw has to beat.
+        // The best score of a motion as drawn, before any optimisation: the next draw has to exceed it.
         let mut best_drawn = Gain::default();
         let mut enough = self.config.max_draws;
         let mut draw = 0;
@@ -191,7 +192,7 @@ impl Search<'_> {
         self.pairs.gain(motion, self.config.inlier_threshold_m, best)
     }
 
-    /// Optimises a motion on the pairs near it; whether it became the new best.
+    /// Optimises a motion on the pairs near it; true if it became the new best.
     fn optimise(&mut self, motion: &Isometry3<f64>, gain: Gain) -> bool {
         let scales = LOCAL_SCALES.map(|scale| scale * self.config.inlier_threshold_m);
         let near = self.pairs.near(motion, refine::CUTOFF_SCALES * scales[0]);
@@ -276,7 +277,7 @@ mod tests {
     }
 
     #[test]
-    fn places_far_from_the_origin_lose_nothing() {
+    fn positions_far_from_the_origin_keep_precision() {
         let mut problem = Problem { count: 400, noise_m: 0.02, ..Problem::default() }.drawn(5);
         let far = nalgebra::Vector3::new(16384.0, -8192.0, 128.0);
         problem.truth.translation.vector += far;
@@ -295,10 +296,10 @@ mod tests {
         let nonsense = Problem { count: 200, outliers: 1.0, ..Problem::default() }.drawn(6);
         let few = solve(&nonsense.pairs, &config).unwrap_err();
         assert!(matches!(few, NoRegistration::TooFewInliers { found: 0..12, required: 12, given: 200 }), "{few}");
-        // All at one place: whatever the motion, it is not fixed.
+        // All at one position: any motion is unconstrained.
         let pair = Correspondence { source_m: [1.0; 3], target_m: [2.0; 3], weight: 1.0 };
         assert!(solve(&[pair; 40], &config).is_err());
-        // On a line: nothing fixes the turn about it.
+        // On a line: the rotation about it is unconstrained.
         let line: Vec<_> = (0..40).map(|k| Correspondence { source_m: [k as f32 * 2.0, 0.0, 0.0], ..pair }).collect();
         let line: Vec<_> = line.iter().map(|p| Correspondence { target_m: p.source_m, ..*p }).collect();
         assert!(matches!(solve(&line, &config), Err(NoRegistration::Degenerate { .. })));

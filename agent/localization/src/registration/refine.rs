@@ -1,8 +1,8 @@
-//! Sharpening a motion: iteratively re-weighted least squares.
+//! Refinement of a motion: iteratively re-weighted least squares.
 //!
-//! Every pair keeps taking part, the less the farther off it is (Geman and McClure 1987): with residual `r` and scale
-//! `c` its weight is multiplied by `1 / (1 + r^2/c^2)^2`. A scale that starts wide and shrinks pulls a rough motion into
-//! place before it listens to the best pairs only.
+//! Every pair keeps its influence, the less the larger its residual (Geman and McClure 1987): with residual `r` and
+//! scale `c` its weight is multiplied by `1 / (1 + r^2/c^2)^2`. A scale that starts wide and shrinks pulls a coarse
+//! motion into place before only the best pairs count.
 
 use nalgebra::{Isometry3, Vector3};
 
@@ -10,7 +10,7 @@ use super::kabsch::{Degenerate, PairMoments};
 
 /// Pairs beyond this many scales weigh less than a hundredth and are left out.
 pub(super) const CUTOFF_SCALES: f64 = 3.0;
-/// A step smaller than this is the last: metres and radians.
+/// Step below which the iteration has converged: metres and radians.
 const CONVERGED: f64 = 1e-4;
 
 /// Re-fits a motion once for every scale of `scales_m`, in turn.
@@ -18,7 +18,7 @@ const CONVERGED: f64 = 1e-4;
 /// `pairs` are source point, target point and weight, all finite.
 ///
 /// # Errors
-/// [`Degenerate`] when the pairs near the motion do not fix it.
+/// [`Degenerate`] when the pairs near the motion do not constrain it.
 pub fn reweighted<I>(
     pairs: &I,
     start: &Isometry3<f64>,
@@ -34,7 +34,7 @@ where
     Ok(motion)
 }
 
-/// Re-fits a motion at one scale until it stands still, at most `max_steps` times.
+/// Re-fits a motion at one scale until it converges, at most `max_steps` times.
 ///
 /// # Errors
 /// See [`reweighted`].
@@ -60,7 +60,7 @@ where
     Ok(motion)
 }
 
-/// What a pair's weight is multiplied by, 0..=1.
+/// Robust kernel: factor on a pair's weight, 0..=1.
 #[must_use]
 pub fn forgiveness(residual_m: f64, scale_m: f64) -> f64 {
     let scaled = residual_m / scale_m;
@@ -77,9 +77,9 @@ fn step(
     let mut moments = PairMoments::default();
     for (source_m, target_m, weight) in pairs {
         let residual = rotation * source_m + motion.translation.vector - target_m;
-        let forgiven = forgiveness(residual.norm(), scale_m);
-        if forgiven > 0.0 {
-            moments.add(&source_m, &target_m, weight * forgiven);
+        let kernel = forgiveness(residual.norm(), scale_m);
+        if kernel > 0.0 {
+            moments.add(&source_m, &target_m, weight * kernel);
         }
     }
     moments.fit()
@@ -98,18 +98,18 @@ mod tests {
     }
 
     #[test]
-    fn a_rough_motion_is_sharpened_among_outliers() {
+    fn a_coarse_motion_is_refined_among_outliers() {
         let problem = Problem { count: 600, outliers: 0.5, noise_m: 0.2, ..Problem::default() }.drawn(1);
         let off = Isometry3::new(Vector3::new(1.2, -0.8, 0.5), Vector3::new(0.01, 0.0, 0.04));
-        let rough = problem.truth * off;
-        let sharpened = reweighted(&pairs(&problem), &rough, [4.0, 2.0, 1.0]).unwrap();
-        let sharpened = converge(&pairs(&problem), &sharpened, 0.5, 20).unwrap();
-        let (metres, degrees) = problem.error(&sharpened);
+        let coarse = problem.truth * off;
+        let refined = reweighted(&pairs(&problem), &coarse, [4.0, 2.0, 1.0]).unwrap();
+        let refined = converge(&pairs(&problem), &refined, 0.5, 20).unwrap();
+        let (metres, degrees) = problem.error(&refined);
         assert!(metres < 0.06 && degrees < 0.1, "{metres} m, {degrees} degrees");
     }
 
     #[test]
-    fn nothing_near_is_said() {
+    fn no_pair_near_is_an_error() {
         let problem = Problem::default().drawn(2);
         let elsewhere = Isometry3::translation(0.0, 0.0, 1e4);
         assert_eq!(converge(&pairs(&problem), &elsewhere, 1.0, 5), Err(Degenerate::NoWeight(0.0)));

@@ -1,4 +1,4 @@
-//! Minimal samples: which pairs to try a motion on, and the motion they fix.
+//! Minimal samples: draws of pairs and the motion that they determine.
 
 use nalgebra::{Isometry3, Matrix3, Rotation3, Translation3, UnitQuaternion, Vector3};
 use rand::Rng;
@@ -6,13 +6,13 @@ use rand_chacha::ChaCha8Rng;
 
 use super::pairs::Pairs;
 
-/// Share of the most trusted pairs that successive draws take from. Half of the draws trust the weights, half do not, so
-/// that weights that say nothing cost a factor of two and no more.
+/// Shares of the pairs of highest weight that successive draws are taken from. Half of the draws follow the weights,
+/// half do not, so that uninformative weights cost a factor of two and no more.
 const POOLS: [f64; 4] = [0.1, 1.0, 0.3, 1.0];
 /// Fewest pairs in a pool.
 const MIN_POOL: usize = 12;
 
-/// What a sample must fulfil before a motion is computed from it.
+/// Conditions on a sample before a motion is computed from it.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct SampleTest {
     /// Shortest distance between two points of a sample, metres.
@@ -23,7 +23,7 @@ pub(super) struct SampleTest {
     pub max_tilt_rad: f64,
 }
 
-/// Draws a motion from three pairs, or `None` when they do not agree with each other.
+/// Draws a motion from three pairs, or `None` if they are inconsistent.
 pub(super) fn three_points(
     pairs: &Pairs,
     draw: u32,
@@ -46,7 +46,7 @@ pub(super) fn three_points(
     Some(motion(rotation, &source, &target))
 }
 
-/// Draws a motion that keeps upright things upright from two pairs, or `None` when they do not agree with each other.
+/// Draws a motion about the vertical from two pairs, or `None` if they are inconsistent.
 pub(super) fn two_points(
     pairs: &Pairs,
     draw: u32,
@@ -69,7 +69,7 @@ pub(super) fn two_points(
     Some(motion(Rotation3::from_axis_angle(&Vector3::z_axis(), yaw_rad), &source, &target))
 }
 
-/// The motion with this rotation that takes centre to centre.
+/// The motion with this rotation that maps one centre to the other.
 fn motion<const N: usize>(
     rotation: Rotation3<f64>,
     source: &[Vector3<f64>; N],
@@ -79,7 +79,7 @@ fn motion<const N: usize>(
     Isometry3::from_parts(Translation3::from(to - rotation * from), UnitQuaternion::from_rotation_matrix(&rotation))
 }
 
-/// Right-handed axes tied to a triangle, as columns; `None` for a needle.
+/// Right-handed axes of a triangle, as columns; `None` for a degenerate one.
 fn axes(points: &[Vector3<f64>; 3]) -> Option<Matrix3<f64>> {
     let first = (points[1] - points[0]).try_normalize(1e-9)?;
     let second = points[2] - points[0];
@@ -92,7 +92,7 @@ fn axes(points: &[Vector3<f64>; 3]) -> Option<Matrix3<f64>> {
     Some(Matrix3::from_columns(&[first, normal.cross(&first), normal]))
 }
 
-/// `N` different places out of `count`; the caller sees to it that there are at least `N`.
+/// `N` distinct indices below `count`; the caller ensures that there are at least `N`.
 fn draw_distinct<const N: usize>(count: usize, draw: u32, random: &mut ChaCha8Rng) -> [usize; N] {
     let share = POOLS[draw as usize % POOLS.len()];
     let pool = ((count as f64 * share) as usize).clamp(MIN_POOL.min(count), count);
@@ -132,7 +132,7 @@ mod tests {
     }
 
     #[test]
-    fn places_differ_even_in_the_smallest_set() {
+    fn indices_differ_even_in_the_smallest_set() {
         let mut random = ChaCha8Rng::seed_from_u64(2);
         for draw in 0..100 {
             let [a, b, c] = draw_distinct(3, draw, &mut random);

@@ -1,8 +1,8 @@
 //! SC2-PCR: registration by second-order spatial compatibility (Chen et al., CVPR 2022).
 //!
-//! Two correspondences are compatible when they keep their distance; what counts here is how many others two compatible
-//! ones are both compatible with. The steps and their order follow the published implementation: leading eigenvector,
-//! seeds, consensus sets in two stages, one weighted fit per seed, the fit with most inliers, refinement. Equal scores keep
+//! Two correspondences are compatible when they keep their distance; their score is the number of others that both are
+//! compatible with. The steps and their order follow the published implementation: leading eigenvector, seeds,
+//! consensus sets in two stages, one weighted fit per seed, the fit with most inliers, refinement. Equal scores keep
 //! the order of their correspondences; the published one leaves that order to an unstable sort.
 
 use nalgebra::{Isometry3, Vector3};
@@ -12,7 +12,7 @@ use super::compatibility::{Bits, distances, leading_eigenvectors};
 use super::kabsch::PairMoments;
 use super::{Correspondence, NoRegistration, Registration, check_enough};
 
-/// Added to sums of weights before dividing by them, as the published implementation does.
+/// Added to sums of weights before dividing by them, as in the published implementation.
 const WEIGHT_EPSILON: f64 = 1e-6;
 /// Size of both consensus sets when there are fewer correspondences than the first one should hold.
 const SMALL_SET: usize = 4;
@@ -25,13 +25,13 @@ pub struct Sc2PcrConfig {
     pub inlier_threshold_m: f64,
     /// Largest change of a distance between compatible correspondences, metres (`d_thre`).
     pub distance_threshold_m: f64,
-    /// Power iterations, at most (`num_iterations`).
+    /// Largest number of power iterations (`num_iterations`).
     pub power_iterations: usize,
     /// Share of the correspondences that become seeds (`ratio`).
     pub seed_ratio: f64,
-    /// Only the strongest within this distance becomes a seed, metres (`nms_radius`).
+    /// Distance within which only the strongest becomes a seed, metres (`nms_radius`).
     pub seed_radius_m: f64,
-    /// Only so many, the most trusted, take part (`max_points`): time and memory grow with the square.
+    /// Largest number that is used, those of the highest weights (`max_points`): time and memory grow with the square.
     pub max_correspondences: usize,
     /// Size of a seed's first consensus set (`k1`).
     pub first_set: usize,
@@ -49,12 +49,12 @@ pub struct Sc2PcrConfig {
 pub struct Refinement {
     /// Largest residual of an inlier, metres.
     pub threshold_m: f64,
-    /// Fits, at most; it ends as soon as the number of inliers stays the same.
+    /// Largest number of fits; it ends as soon as the number of inliers stays the same.
     pub rounds: usize,
 }
 
 impl Sc2PcrConfig {
-    /// The same for correspondences that may be off by `factor` times as much.
+    /// The same for correspondences with `factor` times the error.
     #[must_use]
     pub fn wider(&self, factor: f64) -> Self {
         let refinement =
@@ -69,7 +69,7 @@ impl Sc2PcrConfig {
 }
 
 impl Default for Sc2PcrConfig {
-    /// For scene coordinates that are right to a metre or two.
+    /// For scene coordinates with errors of a metre or two.
     fn default() -> Self {
         Self {
             inlier_threshold_m: 1.5,
@@ -86,7 +86,7 @@ impl Default for Sc2PcrConfig {
     }
 }
 
-/// What the steps gave, before any refinement.
+/// Results of the steps before any refinement.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Consensus {
     /// Leading eigenvector of the first-order compatibility, one entry per correspondence.
@@ -99,11 +99,11 @@ pub struct Consensus {
     pub inlier_count: usize,
 }
 
-/// Finds the motion among outliers; deterministic. Only the most trusted correspondences take part in the search, all in
-/// counting inliers.
+/// Finds the motion among outliers; deterministic. Only the correspondences of the highest weights enter the search,
+/// all of them the count of inliers.
 ///
 /// # Errors
-/// [`NoRegistration`] when there are too few correspondences or too few of them agree.
+/// [`NoRegistration`] when there are too few correspondences or too few inliers.
 pub fn solve(correspondences: &[Correspondence], config: &Sc2PcrConfig) -> Result<Registration, NoRegistration> {
     let required = config.min_inliers.max(SMALL_SET);
     check_enough(correspondences, required)?;
@@ -119,11 +119,11 @@ pub fn solve(correspondences: &[Correspondence], config: &Sc2PcrConfig) -> Resul
         .with_at_least(required, correspondences.len())
 }
 
-/// The steps up to the best seed, on the first [`Sc2PcrConfig::max_correspondences`] correspondences as they come; their
-/// weights are not looked at.
+/// The steps up to the best seed, on the first [`Sc2PcrConfig::max_correspondences`] correspondences in their order;
+/// their weights are ignored.
 ///
 /// # Errors
-/// [`NoRegistration`] when there are fewer than four correspondences or no seed fixes a motion.
+/// [`NoRegistration`] when there are fewer than four correspondences or no seed constrains a motion.
 pub fn consensus(correspondences: &[Correspondence], config: &Sc2PcrConfig) -> Result<Consensus, NoRegistration> {
     check_enough(correspondences, SMALL_SET)?;
     let usable: Vec<_> = correspondences.iter().take(config.max_correspondences).filter(|p| p.usable()).collect();
@@ -209,7 +209,7 @@ fn pick_seeds(source_distances: &[f32], confidence: &[f32], config: &Sc2PcrConfi
     order
 }
 
-/// Places in descending order of value; equal values keep their order.
+/// Indices in descending order of value; equal values keep their order.
 fn descending<T: PartialOrd>(values: &[T]) -> Vec<usize> {
     let mut order: Vec<usize> = (0..values.len()).collect();
     order.sort_by(|&a, &b| values[b].partial_cmp(&values[a]).unwrap_or(std::cmp::Ordering::Equal));
@@ -220,7 +220,7 @@ fn vector(point: &[f32; 3]) -> Vector3<f64> {
     Vector3::from(point.map(f64::from))
 }
 
-/// The correspondences that take part.
+/// The correspondences that are used.
 struct Points {
     source: Vec<[f32; 3]>,
     target: Vec<[f32; 3]>,

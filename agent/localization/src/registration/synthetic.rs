@@ -1,4 +1,4 @@
-//! Problems with a known answer, for tests.
+//! Synthetic registration problems with a known solution, for tests.
 
 use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion};
 use rand::{Rng, SeedableRng};
@@ -7,20 +7,20 @@ use rand_distr::{Distribution, Normal};
 
 use super::Correspondence;
 
-/// What to draw, and what was drawn.
+/// Parameters of a problem, and the pairs drawn.
 #[derive(Debug, Clone)]
 pub(crate) struct Problem {
-    /// Pairs.
+    /// Number of pairs.
     pub(crate) count: usize,
-    /// Share of pairs whose target is anywhere in the town.
+    /// Share of pairs whose target is anywhere in the scene.
     pub(crate) outliers: f64,
     /// Standard deviation of the targets of the others per axis, metres.
     pub(crate) noise_m: f64,
     /// Largest tilt of the vehicle, radians.
     pub(crate) tilt_rad: f64,
-    /// Motion of the answer.
+    /// True `target_from_source`.
     pub(crate) truth: Isometry3<f64>,
-    /// Drawn.
+    /// Drawn pairs.
     pub(crate) pairs: Vec<Correspondence>,
 }
 
@@ -38,7 +38,7 @@ impl Default for Problem {
 }
 
 impl Problem {
-    /// Draws motion and pairs: a sweep of 60 m radius in a town of 400 m.
+    /// Draws motion and pairs: a sweep of 60 m radius in a scene of 400 m.
     pub(crate) fn drawn(mut self, seed: u64) -> Self {
         let mut random = ChaCha8Rng::seed_from_u64(seed);
         let tilt = self.tilt_rad.max(1e-12);
@@ -76,7 +76,7 @@ impl Problem {
         self
     }
 
-    /// Distance in metres and angle in degrees to the answer.
+    /// Distance in metres and angle in degrees to the solution.
     pub(crate) fn error(&self, found: &Isometry3<f64>) -> (f64, f64) {
         let distance_m = (found.translation.vector - self.truth.translation.vector).norm();
         (distance_m, found.rotation.angle_to(&self.truth.rotation).to_degrees())

@@ -1,4 +1,4 @@
-//! `agent eval`: how well a localizer finds poses on recorded sweeps.
+//! `agent eval`: accuracy of a localizer on recorded sweeps.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -28,17 +28,17 @@ use tch::Device;
 use super::scene_heads::{TownHead, by_head};
 use support::cli::{BadInput, Outcome};
 
-/// Localise recorded sweeps and compare with their true poses.
+/// Localize recorded sweeps and compare with their true poses.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Data sets, splits or scenarios of the heads' towns; the layout is found out.
+    /// Data sets, splits or scenarios of the heads' scenes; the layout is detected.
     #[arg(long, value_name = "DIR", num_args = 1.., required = true)]
     scene: Vec<PathBuf>,
     /// Weights of the encoder [default: pgc-encoder.safetensors beside each head].
     #[arg(long, value_name = "FILE")]
     encoder: Option<PathBuf>,
-    /// Weights of the heads: FILE for all scenes, or TOWN=FILE and TOWN:SEED=FILE for generated ones [SEED: 0]. What is
-    /// reported is of all scenes together.
+    /// Weights of the heads: FILE for all scenes, or TOWN=FILE and TOWN:SEED=FILE for generated ones [SEED: 0]. The
+    /// report is over all scenes together.
     #[arg(
         long,
         visible_alias = "weights",
@@ -47,11 +47,11 @@ pub(crate) struct Args {
         default_value = "deploy/weights/pgc-town1.safetensors"
     )]
     head: Vec<TownHead>,
-    /// Instead of encoder and head: weights of a network that `agent train end-to-end` wrote.
+    /// Weights of a network that `agent train end-to-end` wrote, instead of encoder and head.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["encoder", "head", "fit_confidence"])]
     end_to_end: Option<PathBuf>,
-    /// Instead of networks: register every sweep against a map of these drives through the same town (ICP), beginning where
-    /// the GNSS receiver believes to be.
+    /// Register every sweep against a point-cloud map of these drives through the same scene (ICP), starting at the
+    /// pose of the GNSS receiver, instead of networks.
     #[arg(
         long,
         value_name = "DIR",
@@ -59,29 +59,29 @@ pub(crate) struct Args {
         conflicts_with_all = ["encoder", "head", "end_to_end", "fit_confidence", "solver"]
     )]
     icp_map: Vec<PathBuf>,
-    /// Way between two sweeps on that map, metres.
+    /// Distance between two sweeps on that point-cloud map, metres.
     #[arg(long, value_name = "METRES", default_value_t = 5.0, requires = "icp_map")]
     map_spacing: f64,
-    /// Sweeps of another weather, where the data set has them, for example fog_0.060.
+    /// Sweeps of another weather, if the data set has them, for example fog_0.060.
     #[arg(long, value_name = "NAME")]
     variant: Option<String>,
-    /// Take every N-th sweep of each vehicle.
+    /// Use every N-th sweep of each vehicle.
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
     every: u32,
-    /// Most sweeps for each head, evenly over all there are [default: all].
+    /// Largest number of sweeps for each head, evenly over all there are [default: all].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     sweeps: Option<u32>,
-    /// Which search finds the pose.
+    /// Search for the pose.
     #[arg(long, value_enum, default_value_t = Search::Ransac)]
     solver: Search,
     /// Seed of the search.
     #[arg(long, default_value_t = 0)]
     seed: u64,
-    /// Fit the confidence and the threshold below which poses are withheld to these sweeps, and write them into the head.
-    /// Not on sweeps that results are reported on.
+    /// Fit the confidence model and the rejection threshold to these sweeps, and write them into the head. Not on
+    /// sweeps that results are reported on.
     #[arg(long)]
     fit_confidence: bool,
-    /// Largest share of poses less than 3 m off that --fit-confidence may withhold.
+    /// Largest share of poses less than 3 m off that --fit-confidence may reject.
     #[arg(long, value_name = "SHARE", default_value_t = 0.01, requires = "fit_confidence")]
     good_loss: f64,
     /// Write a row per sweep.
@@ -93,7 +93,7 @@ pub(crate) struct Args {
     /// Write the errors as a table that --pose-source noisy replays.
     #[arg(long, value_name = "FILE")]
     error_table: Option<PathBuf>,
-    /// Where to compute.
+    /// Device to compute on.
     #[arg(long, value_enum, default_value_t = ComputeOn::Cpu)]
     device: ComputeOn,
     /// Threads to compute with.
@@ -114,28 +114,28 @@ enum Search {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum ComputeOn {
-    /// The processor.
+    /// The CPU.
     Cpu,
     /// The first CUDA device.
     Cuda,
 }
 
-/// What is evaluated.
+/// Method under evaluation.
 enum Subject {
-    /// Looks at sweeps alone.
+    /// Localizer: uses sweeps alone.
     Localizer(Box<dyn Localize>),
-    /// Is told where the GNSS receiver believes to be.
+    /// Pose source: also gets the pose of the GNSS receiver.
     Source(Box<dyn PoseSource>),
 }
 
-/// Localises, fits, writes and prints.
+/// Localizes, fits, writes and prints.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     tch::set_num_threads(i32::from(args.threads));
     check_good_loss(args.good_loss).map_err(|error| BadInput::new(format!("--good-loss: {error}")))?;
     let groups = by_head(&args.head, &args.scene)?;
     if args.fit_confidence && groups.len() > 1 {
         let count = groups.len();
-        return Err(BadInput::new(format!("--fit-confidence fits one head, and {count} are asked for")).into());
+        return Err(BadInput::new(format!("--fit-confidence fits one head, {count} are given")).into());
     }
     let (mut sweeps, mut left_out) = (Vec::new(), LeftOut::default());
     for (head, scenes) in &groups {
@@ -248,10 +248,10 @@ impl Args {
 fn report_line(report: &FitReport) -> String {
     let FitReport { sweeps, bad, bad_withheld, good_withheld } = report;
     let good = sweeps - bad;
-    format!("fitted to {sweeps} poses: withholds {bad_withheld} of {bad} bad ones, {good_withheld} of {good} good ones")
+    format!("fitted to {sweeps} poses: rejects {bad_withheld} of {bad} bad ones, {good_withheld} of {good} good ones")
 }
 
-/// The numbers for a person.
+/// Report as text.
 fn table(summary: &LocalizationSummary) -> String {
     let number = |value: Option<f64>, digits: usize| value.map_or("-".into(), |value| format!("{value:.digits$}"));
     let percent = |share: f64| format!("{:.1} %", 100.0 * share);
@@ -278,13 +278,13 @@ fn table(summary: &LocalizationSummary) -> String {
             number(summary.max_deg, 1)
         ),
         format!(
-            "sigma      rank correlation {} (share of inliers {}), calibration error {}",
+            "sigma      rank correlation {} (inlier ratio {}), calibration error {}",
             number(summary.sigma_spearman, 2),
             number(summary.inlier_ratio_spearman, 2),
             number(summary.calibration_error, 3)
         ),
         format!(
-            "withheld   {} poses: {} of {} errors above 3 m, {} of the others",
+            "rejected   {} poses: {} of {} errors above 3 m, {} of the others",
             withheld.poses,
             share(withheld.bad_share),
             withheld.bad,

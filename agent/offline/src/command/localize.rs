@@ -1,4 +1,4 @@
-//! `agent localize`: the poses of recorded sweeps, found once and kept.
+//! `agent localize`: writes the poses of recorded sweeps to a table.
 
 use std::path::{Path, PathBuf};
 
@@ -13,9 +13,9 @@ use support::progress;
 use super::scene_heads::{TownHead, head_of};
 use support::cli::{BadInput, Outcome};
 
-/// Localise every sweep of scenes once and write poses and confidences as a table, for trainings and evaluations.
+/// Localize every sweep of scenes once and write poses and confidences to a table, for training and evaluation.
 ///
-/// Scenarios that the table has already are left alone, so an interrupted run goes on where it was.
+/// Scenarios that are in the table already are skipped, so an interrupted run continues where it stopped.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
     /// Data sets, splits or scenarios.
@@ -35,7 +35,7 @@ pub(crate) struct Args {
     threads: u16,
 }
 
-/// Localises what the table does not have yet.
+/// Localizes the scenarios that are not in the table yet.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     tch::set_num_threads(i32::from(args.threads));
     let done = if args.out.exists() { PoseTable::read(&args.out).map_err(bad)? } else { PoseTable::default() };
@@ -44,12 +44,12 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
         scenarios.extend(dataset::open(folder).map_err(bad)?.scenarios);
     }
     scenarios.retain(|scenario| !done.has(&scenario.name));
-    // Which head each needs is known before any is computed with.
+    // All heads are found before any is computed with.
     let heads: Vec<&Path> = scenarios.iter().map(|scenario| head_of(&args.head, scenario)).collect::<Result<_, _>>()?;
     let sweeps: usize = scenarios.iter().map(frames).sum();
     if sweeps == 0 && done.is_empty() {
         let scenes: Vec<String> = args.scene.iter().map(|scene| scene.display().to_string()).collect();
-        return Err(bad(anyhow::anyhow!("there is no sweep in {}", scenes.join(", "))));
+        return Err(bad(anyhow::anyhow!("no sweep in {}", scenes.join(", "))));
     }
     let bar = progress::bar(sweeps, "sweeps");
     let mut found = 0;
@@ -59,7 +59,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     }
     bar.finish_and_clear();
     output::line(format_args!(
-        "{sweeps} sweeps, {found} with a pose; {} were there before: {}",
+        "{sweeps} sweeps, {found} with a pose; {} were in the table before: {}",
         done.len(),
         args.out.display()
     ))?;
@@ -67,7 +67,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
 }
 
 impl Args {
-    /// Localises a scenario, vehicle by vehicle in the order of time, and appends it; how many sweeps have a pose.
+    /// Localizes a scenario, vehicle by vehicle in the order of time, and appends it; the number of sweeps with a pose.
     fn localize(
         &self,
         scenario: &Scenario,
@@ -99,7 +99,7 @@ impl Args {
     }
 }
 
-/// Frames that there are in a scenario.
+/// Number of frames of a scenario.
 fn frames(scenario: &Scenario) -> usize {
     scenario.agents.len() * scenario.ticks.len() - scenario.absent_frames()
 }

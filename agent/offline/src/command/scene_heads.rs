@@ -1,4 +1,4 @@
-//! Heads of several towns, and which of them a scene is for.
+//! Choice of the scene-specific head of a scenario.
 
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
@@ -9,7 +9,7 @@ use serde::Deserialize;
 
 use support::cli::BadInput;
 
-/// A generated town: the name of its map and the seed of all that stands on it.
+/// A generated scene: the name of its road map and the seed of its objects.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 struct Town {
     #[serde(rename = "town")]
@@ -17,7 +17,7 @@ struct Town {
     town_seed: u64,
 }
 
-/// Weights, and the town they are of: `FILE` for all scenes, `TOWN=FILE` and `TOWN:SEED=FILE` for generated ones.
+/// Weights and their scene: `FILE` for all scenes, `TOWN=FILE` and `TOWN:SEED=FILE` for generated ones.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct TownHead {
     town: Option<Town>,
@@ -40,7 +40,7 @@ impl FromStr for TownHead {
 /// The weights of the head for a scenario.
 ///
 /// # Errors
-/// [`BadInput`] when its town cannot be read or has no head, and when one of several heads names no town.
+/// [`BadInput`] when its town cannot be read or has no head, and when one of several heads has no town.
 pub(crate) fn head_of<'a>(heads: &'a [TownHead], scenario: &Scenario) -> Result<&'a Path, BadInput> {
     if let [TownHead { town: None, weights }] = heads {
         return Ok(weights);
@@ -57,7 +57,7 @@ pub(crate) fn head_of<'a>(heads: &'a [TownHead], scenario: &Scenario) -> Result<
     Ok(&head.ok_or_else(missing)?.weights)
 }
 
-/// Each head that scenes need, with those scenes: in the order in which they come up.
+/// Each head that scenes need, with those scenes, in the order of their first use.
 ///
 /// # Errors
 /// [`BadInput`] as [`head_of`], and when a folder has no scenario, or scenarios of several towns.
@@ -85,13 +85,13 @@ pub(crate) fn by_head<'a>(
     Ok(groups)
 }
 
-/// The part of `data_protocol.yaml` that tells the town.
+/// The part of `data_protocol.yaml` that names the town.
 #[derive(Debug, Deserialize)]
 struct ProtocolFile {
     generator: Town,
 }
 
-/// Reads which generated town a scenario lies in.
+/// Reads the generated town of a scenario.
 fn town_of(scenario: &Scenario) -> anyhow::Result<Town> {
     let points = scenario.points_path(0, 0, None)?;
     let folder = points.ancestors().nth(2).context("it lies in no folder")?;

@@ -1,4 +1,4 @@
-//! A localizer on recorded sweeps whose poses are known.
+//! Evaluation of a localizer on recorded sweeps with known poses.
 
 mod summary;
 mod table;
@@ -19,79 +19,79 @@ use localization::pgc::{Localization, Localize, LocalizerTimes};
 use localization::pose_error::PoseError;
 use localization::pose_source::{PoseInput, PoseSource};
 
-/// Which sweeps.
+/// Selection of sweeps.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct EvaluationOptions {
-    /// Datasets, splits or scenarios, all of one world.
+    /// Data sets, splits or scenarios, all of one world.
     pub scenes: Vec<PathBuf>,
     /// A variant of the sweeps, for example `fog_0.060`.
     pub variant: Option<String>,
-    /// Every how many ticks a sweep is taken.
+    /// Stride in ticks between two sweeps that are used.
     pub every: usize,
-    /// Most sweeps, evenly over all there are.
+    /// Largest number of sweeps, evenly over all there are.
     pub sweeps: Option<usize>,
 }
 
-/// Why an evaluation ended early.
+/// Error that ends an evaluation early.
 #[derive(Debug, thiserror::Error)]
 pub enum EvaluationError {
     /// A dataset or a frame cannot be read.
     #[error(transparent)]
     Read(#[from] ReadError),
-    /// There is nothing to evaluate on.
-    #[error("there is no sweep in {0:?}")]
+    /// There is no sweep.
+    #[error("no sweep in {0:?}")]
     Empty(Vec<PathBuf>),
     /// A sweep has no pose to compare with.
     #[error("{scenario}: {cav} at {stem}: there is no true pose to compare with (agent localize finds poses without)")]
     NoTruth {
-        /// The scenario.
+        /// Name of the scenario.
         scenario: String,
-        /// The vehicle.
+        /// Vehicle.
         cav: CavId,
-        /// The frame's name.
+        /// Name of the frame.
         stem: String,
     },
-    /// The localizer refused.
+    /// The localizer failed.
     #[error(transparent)]
     Localizer(#[from] LocalizerError),
 }
 
-/// What came of one sweep.
+/// Result of one sweep.
 #[derive(Debug, Clone, PartialEq)]
 pub struct EvaluatedSweep {
-    /// The scenario.
+    /// Name of the scenario.
     pub scenario: String,
-    /// The vehicle.
+    /// Vehicle.
     pub cav: CavId,
-    /// The frame's name.
+    /// Name of the frame.
     pub stem: String,
     /// True `world_from_lidar`.
     pub truth: Pose,
-    /// What the localizer said.
+    /// Result of the localizer.
     pub localization: Localization,
 }
 
 impl EvaluatedSweep {
-    /// Error of the pose that was found, withheld or not.
+    /// Error of the estimated pose, rejected or not.
     #[must_use]
     pub fn error(&self) -> Option<PoseError> {
         self.localization.found.map(|found| PoseError::between(&found.world_from_sensor.into(), &self.truth))
     }
 
-    /// Error of the pose that was told, if one was.
+    /// Error of the pose that is published, if there is one.
     #[must_use]
     pub fn told_error(&self) -> Option<PoseError> {
         self.localization.estimate.world_from_cav().map(|pose| PoseError::between(pose, &self.truth))
     }
 
-    /// What a confidence is fitted on.
+    /// Sample for the fit of a confidence model.
     #[must_use]
     pub fn labelled(&self) -> Option<Labelled> {
         let found = self.localization.found?;
         Some(Labelled { evidence: found.evidence, error_m: self.error()?.distance_m })
     }
 
-    /// Applies another confidence to what was found.
+    /// Applies another confidence model to the estimated pose.
     pub fn judge_again(&mut self, confidence: &Confidence) {
         let Some(found) = &mut self.localization.found else { return };
         found.sigma = confidence.sigma(&found.evidence);
@@ -100,27 +100,27 @@ impl EvaluatedSweep {
     }
 }
 
-/// What came of all sweeps.
+/// Results of all sweeps.
 #[derive(Debug, Default)]
 pub struct Evaluated {
-    /// Each in turn, vehicle by vehicle.
+    /// Results vehicle by vehicle, in the order of time.
     pub sweeps: Vec<EvaluatedSweep>,
     /// Sweeps and other data that could not be used.
     pub left_out: LeftOut,
 }
 
-/// A sweep that is there.
+/// A sweep of a scenario.
 struct Sweep<'a> {
     scenario: &'a Scenario,
     agent: usize,
     tick: usize,
 }
 
-/// Localises every sweep of the scenes in turn; `on_sweep` is told how many there are and how many are done.
+/// Localizes every sweep of the scenes in turn; `on_sweep` gets the number done and the number of all.
 ///
 /// # Errors
-/// [`EvaluationError`] when a data set cannot be opened, and at the first sweep without a true pose. Sweeps that cannot be
-/// read are left out and counted.
+/// [`EvaluationError`] when a data set cannot be opened, and at the first sweep without a true pose. Sweeps that cannot
+/// be read are left out and counted.
 pub fn evaluate(
     localizer: &mut dyn Localize,
     options: &EvaluationOptions,
@@ -129,7 +129,7 @@ pub fn evaluate(
     evaluate_with(&mut |frame| localizer.localize(&frame.points), options, on_sweep)
 }
 
-/// The same for a pose source, which is shown what the GNSS receiver believed.
+/// The same for a pose source, which gets the pose of the GNSS receiver.
 ///
 /// # Errors
 /// As [`evaluate`].
@@ -189,7 +189,7 @@ fn evaluate_with(
     Ok(evaluated)
 }
 
-/// Vehicle by vehicle, in the order of time.
+/// Sweeps vehicle by vehicle, in the order of time.
 fn sweeps_of(scenario: &Scenario, every: usize) -> impl Iterator<Item = Sweep<'_>> {
     let ticks = move |agent| {
         (0..scenario.ticks.len()).step_by(every.max(1)).filter(move |&tick| scenario.is_present(agent, tick))
@@ -197,7 +197,7 @@ fn sweeps_of(scenario: &Scenario, every: usize) -> impl Iterator<Item = Sweep<'_
     (0..scenario.agents.len()).flat_map(move |agent| ticks(agent).map(move |tick| Sweep { scenario, agent, tick }))
 }
 
-/// A word for what became of a sweep.
+/// Name of a sweep's outcome.
 fn outcome(estimate: &PoseEstimate) -> &'static str {
     use protocol::NoPoseReason::{Failed, LowConfidence, NoSource, TooFewInliers, TooFewPoints};
     match estimate {
@@ -218,7 +218,7 @@ pub(super) mod tests {
     use localization::pgc::synthetic::SyntheticScene;
     use protocol::PointCloud;
 
-    /// Sweeps of a town that gets harder and harder; every tenth is empty.
+    /// Sweeps of a scene of increasing difficulty; every tenth is empty.
     pub(crate) fn evaluated(count: u64) -> Vec<EvaluatedSweep> {
         (0..count)
             .map(|seed| {
@@ -226,20 +226,20 @@ pub(super) mod tests {
                 let outliers = 0.1 + 0.85 * hardness;
                 let twins = 0.6 * hardness;
                 let cells = if seed % 10 == 9 { 0 } else { 300 };
-                let mut town = SyntheticScene { cells, outliers, twins, next_seed: seed, ..SyntheticScene::default() };
+                let mut scene = SyntheticScene { cells, outliers, twins, next_seed: seed, ..SyntheticScene::default() };
                 EvaluatedSweep {
                     scenario: "town".into(),
                     cav: CavId::new("7").unwrap(),
                     stem: format!("{seed:06}"),
-                    truth: town.world_from_sensor(seed).into(),
-                    localization: town.localize(&PointCloud::default()).unwrap(),
+                    truth: scene.world_from_sensor(seed).into(),
+                    localization: scene.localize(&PointCloud::default()).unwrap(),
                 }
             })
             .collect()
     }
 
     #[test]
-    fn another_confidence_changes_what_is_told_and_not_what_was_found() {
+    fn another_confidence_changes_the_published_pose_and_not_the_estimated_one() {
         let mut sweep = evaluated(10).swap_remove(0);
         let found = sweep.error().unwrap();
         assert_eq!(sweep.told_error(), Some(found));

@@ -1,4 +1,4 @@
-//! The numbers of an evaluation, and its reliability curve.
+//! Summary of an evaluation: error and calibration figures, and the reliability curve.
 
 use std::collections::BTreeMap;
 
@@ -11,81 +11,82 @@ use figures::{Axis, Chart, Mark, Series};
 use localization::pgc::confidence::{BAD_M, observed};
 use localization::statistics::spearman;
 
-/// Groups of equally many sweeps that calibration is judged by.
+/// Number of groups of equally many sweeps in the calibration curve.
 const BINS: usize = 10;
 
-/// What an evaluation comes to. Errors are those of poses that were told; a sweep without one is no success.
+/// Results of an evaluation. Errors are those of published poses; a sweep without one is no success.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct LocalizationSummary {
-    /// Sweeps.
+    /// Number of sweeps.
     pub sweeps: usize,
-    /// Share of sweeps whose pose is less than 3 m off.
+    /// Share of sweeps with an error below 3 m, 0..=1.
     pub success_3m: f64,
-    /// Share less than 1 m off.
+    /// Share of sweeps with an error below 1 m, 0..=1.
     pub success_1m: f64,
-    /// Mean distance, metres.
+    /// Mean distance error, metres.
     pub mean_m: Option<f64>,
-    /// Median.
+    /// Median distance error, metres.
     pub p50_m: Option<f64>,
-    /// 95th percentile.
+    /// 95th percentile of the distance error, metres.
     pub p95_m: Option<f64>,
-    /// Largest.
+    /// Largest distance error, metres.
     pub max_m: Option<f64>,
-    /// Mean angle, degrees.
+    /// Mean angle error, degrees.
     pub mean_deg: Option<f64>,
-    /// Median.
+    /// Median angle error, degrees.
     pub p50_deg: Option<f64>,
-    /// 95th percentile.
+    /// 95th percentile of the angle error, degrees.
     pub p95_deg: Option<f64>,
-    /// Largest.
+    /// Largest angle error, degrees.
     pub max_deg: Option<f64>,
-    /// Sweeps without a pose, withheld ones included.
+    /// Number of sweeps without a pose, rejected ones included.
     pub no_pose: usize,
-    /// What became of the sweeps.
+    /// Number of sweeps by outcome.
     pub outcomes: BTreeMap<&'static str, usize>,
-    /// Spearman's correlation of sigma and distance over all poses found, withheld ones included; -1 is perfect.
+    /// Spearman's correlation of sigma and distance error over all estimated poses, rejected ones included; -1 is
+    /// perfect.
     pub sigma_spearman: Option<f64>,
-    /// The same of the share of inliers alone.
+    /// The same of the inlier ratio alone.
     pub inlier_ratio_spearman: Option<f64>,
-    /// Mean absolute difference of sigma from what it should be, over groups of equally many poses.
+    /// Mean absolute difference of sigma from its target, over groups of equally many poses.
     pub calibration_error: Option<f64>,
-    /// Those groups, by rising sigma.
+    /// Those groups, by ascending sigma.
     pub calibration: Vec<CalibrationBin>,
-    /// What is withheld, and at which price.
+    /// Rejected poses, and the good ones among them.
     pub withheld: WithheldSummary,
-    /// Median milliseconds by stage; `total` is that of whole sweeps.
+    /// Median milliseconds by stage; `total` is that of all stages of a sweep.
     pub ms: BTreeMap<String, f64>,
 }
 
 /// Poses of similar sigma.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct CalibrationBin {
-    /// Poses.
+    /// Number of poses.
     pub poses: usize,
-    /// Their mean sigma.
+    /// Mean sigma, 0..=1.
     pub sigma: f64,
-    /// What it should be: the mean of `1 / (1 + e^2)` of their errors in metres.
+    /// Target of sigma: the mean of `1 / (1 + e^2)` of their errors in metres.
     pub observed: f64,
-    /// Their median distance, metres.
+    /// Median distance error, metres.
     pub p50_m: f64,
-    /// Share of them less than 3 m off.
+    /// Share of them with an error below 3 m, 0..=1.
     pub success_3m: f64,
 }
 
-/// How well withholding works.
+/// Results of the rejection threshold.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct WithheldSummary {
-    /// Poses found and withheld.
+    /// Number of estimated poses that are rejected.
     pub poses: usize,
-    /// Poses found that are more than 3 m off.
+    /// Number of estimated poses with an error above 3 m.
     pub bad: usize,
-    /// Share of them that is withheld.
+    /// Share of them that is rejected, 0..=1.
     pub bad_share: Option<f64>,
-    /// Share of the others that is withheld.
+    /// Share of the others that is rejected, 0..=1.
     pub good_share: Option<f64>,
 }
 
-/// Sigma and error of a pose that was found.
+/// Sigma and error of an estimated pose.
 #[derive(Debug, Clone, Copy)]
 struct Judged {
     sigma: f64,
@@ -94,12 +95,12 @@ struct Judged {
 }
 
 impl LocalizationSummary {
-    /// Sums sweeps up.
+    /// Summary of sweeps.
     #[must_use]
     pub fn of(sweeps: &[EvaluatedSweep]) -> Self {
-        let told: Vec<_> = sweeps.iter().filter_map(EvaluatedSweep::told_error).collect();
-        let metres = sorted(&told.iter().map(|error| error.distance_m).collect::<Vec<_>>());
-        let degrees = sorted(&told.iter().map(|error| error.angle_deg).collect::<Vec<_>>());
+        let published: Vec<_> = sweeps.iter().filter_map(EvaluatedSweep::told_error).collect();
+        let metres = sorted(&published.iter().map(|error| error.distance_m).collect::<Vec<_>>());
+        let degrees = sorted(&published.iter().map(|error| error.angle_deg).collect::<Vec<_>>());
         let success = |limit_m: f64| {
             metres.iter().filter(|&&error_m| error_m < limit_m).count() as f64 / sweeps.len().max(1) as f64
         };
@@ -127,7 +128,7 @@ impl LocalizationSummary {
             p50_deg: quantile(&degrees, 0.5),
             p95_deg: quantile(&degrees, 0.95),
             max_deg: degrees.last().copied(),
-            no_pose: sweeps.len() - told.len(),
+            no_pose: sweeps.len() - published.len(),
             outcomes,
             sigma_spearman: spearman(&sigmas, &errors),
             inlier_ratio_spearman: spearman(&ratios, &errors),
@@ -194,7 +195,8 @@ fn median_times(sweeps: &[EvaluatedSweep]) -> BTreeMap<String, f64> {
 pub fn reliability_charts(sweeps: &[EvaluatedSweep]) -> Vec<Chart> {
     let judged = judged(sweeps);
     let bins = calibration(&judged);
-    let told = sweeps.iter().filter(|sweep| matches!(sweep.localization.estimate, PoseEstimate::Pose { .. })).count();
+    let published =
+        sweeps.iter().filter(|sweep| matches!(sweep.localization.estimate, PoseEstimate::Pose { .. })).count();
     let cloud = |name: &str, is_withheld: bool| Series {
         name: name.into(),
         points: (judged.iter().filter(|pose| pose.is_withheld == is_withheld))
@@ -203,7 +205,7 @@ pub fn reliability_charts(sweeps: &[EvaluatedSweep]) -> Vec<Chart> {
         mark: Mark::Dots,
     };
     let reliability = Chart {
-        title: format!("Reliability, {} sweeps, {told} poses told", sweeps.len()),
+        title: format!("Reliability, {} sweeps, {published} poses published", sweeps.len()),
         x: Axis::linear("sigma", [0.0, 1.0]),
         y: Axis::linear("mean of 1 / (1 + e^2), e in m", [0.0, 1.0]),
         series: vec![
@@ -216,13 +218,13 @@ pub fn reliability_charts(sweeps: &[EvaluatedSweep]) -> Vec<Chart> {
         ],
     };
     let errors = Chart {
-        title: "Error of every pose found".into(),
+        title: "Error of every estimated pose".into(),
         x: Axis::linear("sigma", [0.0, 1.0]),
         y: Axis::logarithmic("distance to the true position, m", [0.01, 1000.0]),
         series: vec![
-            cloud("told", false),
+            cloud("published", false),
             Series { name: "3 m".into(), points: vec![(0.0, BAD_M), (1.0, BAD_M)], mark: Mark::Line },
-            cloud("withheld", true),
+            cloud("rejected", true),
         ],
     };
     vec![reliability, errors]
@@ -246,7 +248,7 @@ mod tests {
         assert!(summary.sigma_spearman.unwrap() < -0.5);
         assert_eq!((summary.withheld.poses, summary.withheld.good_share), (0, Some(0.0)));
         assert_eq!(summary.ms.len(), 6);
-        // Withholding everything makes every sweep one without pose, and errors nobody was told vanish.
+        // Rejecting everything leaves every sweep without a pose, and the errors of unpublished poses do not count.
         let all = Confidence::Calibrated(ConfidenceModel { withhold_below: 1.1, ..ConfidenceModel::example() });
         sweeps.iter_mut().for_each(|sweep| sweep.judge_again(&all));
         let silent = LocalizationSummary::of(&sweeps);
@@ -256,7 +258,7 @@ mod tests {
     }
 
     #[test]
-    fn the_names_that_others_read_are_there() {
+    fn the_serialised_names_are_there() {
         let json = serde_json::to_value(LocalizationSummary::of(&evaluated(12))).unwrap();
         for name in
             ["sweeps", "success_3m", "success_1m", "mean_m", "p50_m", "p95_m", "mean_deg", "p50_deg", "sigma_spearman"]

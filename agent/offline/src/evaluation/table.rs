@@ -1,4 +1,4 @@
-//! Every sweep of an evaluation as a row of text.
+//! Table of an evaluation: one row per sweep.
 
 use std::fs;
 use std::io;
@@ -17,7 +17,7 @@ const HEADER: &str = "scenario,cav,frame,true_x_m,true_y_m,true_z_m,true_yaw_deg
 /// Writes one row per sweep; fields of sweeps without a pose are empty.
 ///
 /// # Errors
-/// The system's, when the file cannot be written.
+/// The system's, if the file cannot be written.
 pub fn write_csv(path: &Path, sweeps: &[EvaluatedSweep]) -> io::Result<()> {
     fs::write(path, csv(sweeps))
 }
@@ -25,7 +25,7 @@ pub fn write_csv(path: &Path, sweeps: &[EvaluatedSweep]) -> io::Result<()> {
 /// Writes the errors of all sweeps as the table that the pose source `noisy` replays.
 ///
 /// # Errors
-/// The system's, when the file cannot be written.
+/// The system's, if the file cannot be written.
 pub fn write_error_table(path: &Path, sweeps: &[EvaluatedSweep]) -> io::Result<()> {
     fs::write(path, error_table(sweeps))
 }

@@ -1,5 +1,5 @@
-//! The loss that makes an encoder tell places apart: contrastive over cells (InfoNCE, van den Oord et al. 2018), and the
-//! offset between two views of one spot, so that features also say where exactly a cell lies.
+//! Contrastive loss of the encoder over cells (InfoNCE, van den Oord et al. 2018), plus the offset between two views of
+//! one spot, so that features also encode the exact position of a cell.
 
 use tch::nn::{self, Init, LinearConfig, Module};
 use tch::{Device, Kind, TchError, Tensor};
@@ -7,28 +7,29 @@ use tch::{Device, Kind, TchError, Tensor};
 use super::pairs::{ChosenCells, Pair};
 use localization::pgc::{SceneEncoder, VoxelBatch};
 
-/// Channels that similarity is measured in.
+/// Channels of the embedding in which similarity is measured.
 const EMBEDDING: i64 = 64;
 /// Temperature of the softmax over similarities.
 const TEMPERATURE: f64 = 0.07;
-/// A partner's cells closer than this to the spot, other than the match, are neither right nor wrong, metres.
+/// Distance from the spot below which a partner's cells other than the match are neither positives nor negatives,
+/// metres.
 const NEITHER_M: f64 = 3.0;
 /// Weight of the offset term, per metre.
 const OFFSET_WEIGHT: f64 = 0.5;
-/// Logit of what must not be chosen.
+/// Logit of excluded candidates.
 const NEVER: f64 = -1e4;
 
-/// What is trained beside the encoder and thrown away afterwards.
+/// Layers that are trained beside the encoder and discarded afterwards.
 #[derive(Debug)]
 pub(super) struct Contrast {
     embedding: nn::Linear,
     offset: [nn::Linear; 2],
 }
 
-/// The loss of some pairs and what it consists of.
+/// Loss of some pairs and its parts.
 #[derive(Debug)]
 pub(super) struct ContrastLoss {
-    /// To be minimised.
+    /// Sum that is minimised.
     pub(super) total: Tensor,
     /// Share of cells whose most similar candidate is their match.
     pub(super) top1: f64,
@@ -50,10 +51,10 @@ impl Contrast {
         }
     }
 
-    /// Encodes all sweeps of `pairs` in one pass and measures.
+    /// Encodes all sweeps of `pairs` in one pass and computes the loss.
     ///
     /// # Errors
-    /// The tensor library's.
+    /// Those of the tensor library.
     pub(super) fn loss(
         &self,
         encoder: &SceneEncoder,
@@ -135,7 +136,7 @@ fn sweep_rows(rows: &[usize], first: i64) -> impl Iterator<Item = i64> + '_ {
     rows.iter().map(move |&row| first + row as i64)
 }
 
-/// Which candidate of all pairs is the match of each cell.
+/// Index of the match of each cell among the candidates of all pairs.
 fn matches(pairs: &[Pair], device: Device) -> Result<Tensor, TchError> {
     let mut first = 0;
     let mut all = Vec::new();
@@ -146,7 +147,7 @@ fn matches(pairs: &[Pair], device: Device) -> Result<Tensor, TchError> {
     Tensor::f_from_slice(&all)?.f_to_device(device)
 }
 
-/// `[anchors, partners]`: what keeps candidates out that are neither right nor wrong.
+/// `[anchors, partners]`: mask of candidates that are neither positives nor negatives.
 fn neither(pairs: &[Pair], device: Device) -> Result<Tensor, TchError> {
     let count = |side: fn(&Pair) -> &ChosenCells| pairs.iter().map(|pair| side(pair).rows.len() as i64).sum::<i64>();
     let mask = Tensor::f_zeros([count(|pair| &pair.anchor), count(|pair| &pair.partner)], (Kind::Float, device))?;

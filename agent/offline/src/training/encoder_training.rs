@@ -1,4 +1,5 @@
-//! First stage: the encoder, over many towns, on correspondences between sweeps that overlap. Trained once, then frozen.
+//! First stage: the encoder, over many scenes, on correspondences between overlapping sweeps. Trained once, then
+//! frozen.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -17,27 +18,27 @@ use localization::pgc::{SceneEncoder, SceneEncoderConfig};
 use perception::train::{Curve, DataListing, Prefetch, RunConfig, Trained, Trainer};
 use perception::weights::{CONFIG_KEY, KIND_KEY};
 
-/// Pairs that a validation looks at.
+/// Number of pairs of a validation.
 const VALIDATION_PAIRS: u64 = 24;
 /// Steps between two reports.
 const REPORT_EVERY: u64 = 10;
 
-/// What to train, on what, for how long.
+/// Configuration of a training of an encoder.
 #[derive(Debug, Clone)]
 pub struct EncoderTrainConfig {
-    /// Folders of scenes, one world each.
+    /// Folders of sweeps, one world each.
     pub scenes: Vec<PathBuf>,
-    /// Folders of scenes to validate on, one world each; none: no validation.
+    /// Folders of sweeps to validate on, one world each; none: no validation.
     pub validation: Vec<PathBuf>,
-    /// The network.
+    /// Network.
     pub encoder: SceneEncoderConfig,
-    /// How; a batch are pairs of sweeps.
+    /// Training run; a batch are pairs of sweeps.
     pub run: RunConfig,
     /// Steps between two validations and checkpoints.
     pub validate_every: u64,
 }
 
-/// How well places are told apart.
+/// Accuracy of the matching of cells.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct EncoderAccuracy {
     /// Share of cells whose most similar candidate is their match.
@@ -46,7 +47,7 @@ pub struct EncoderAccuracy {
     pub offset_m: f64,
 }
 
-/// Where a training of an encoder is.
+/// Progress of a training of an encoder.
 #[derive(Debug, Clone, PartialEq)]
 pub enum EncoderReport {
     /// Sweeps to learn from or to validate on have been read.
@@ -55,7 +56,7 @@ pub enum EncoderReport {
     Stepped {
         /// Steps done.
         step: u64,
-        /// Share that is done, 0..1.
+        /// Share of the training that is done, 0..1.
         share_done: f64,
         /// Seconds spent so far.
         seconds: f64,
@@ -68,12 +69,12 @@ pub enum EncoderReport {
     Validated(u64, EncoderAccuracy),
 }
 
-/// How a training of an encoder ended.
+/// Result of a training of an encoder.
 #[derive(Debug, Clone)]
 pub struct EncoderSummary {
-    /// The weights and what it took.
+    /// Weights, steps and time.
     pub trained: Trained,
-    /// Sweeps it learnt from.
+    /// Number of training sweeps.
     pub sweeps: usize,
     /// The last validation.
     pub accuracy: Option<EncoderAccuracy>,
@@ -176,7 +177,7 @@ impl<'a> Training<'a> {
         Ok(())
     }
 
-    /// What the steps of `window` were like, in the curve too.
+    /// Report of the steps of `window`, also appended to the curve.
     fn report(&mut self, window: Window) -> Result<EncoderReport, LocalizerTrainError> {
         let (loss, accuracy) = window.means();
         let (step, seconds) = (self.trainer.steps(), self.trainer.seconds());
@@ -198,7 +199,7 @@ impl<'a> Training<'a> {
     }
 
     fn finish(self) -> Result<EncoderSummary, LocalizerTrainError> {
-        // Only the encoder goes out, under the names it is loaded by.
+        // Only the encoder is saved, under the names it is loaded by.
         let encoder = VarStore::new(Device::Cpu);
         SceneEncoder::new(&encoder.root(), &self.config.encoder)?;
         let trained = self.variables.variables();

@@ -1,4 +1,4 @@
-//! Why a training of a localizer ends early.
+//! Errors of a training of a localizer.
 
 use std::path::PathBuf;
 
@@ -7,28 +7,28 @@ use dataset::ReadError;
 use localization::pgc::LocalizerError;
 use perception::train::TrainingError;
 
-/// Why a training ended early.
+/// Error that ends a training early.
 #[derive(Debug, thiserror::Error)]
 pub enum LocalizerTrainError {
     /// A scene cannot be read.
     #[error(transparent)]
     Read(#[from] ReadError),
-    /// No folder holds a sweep whose pose is known.
+    /// No folder holds a sweep with a known pose.
     #[error("no sweep with a pose in {0:?}")]
     NoSweeps(Vec<PathBuf>),
-    /// Sweeps do not overlap, so there is nothing to learn correspondences from.
+    /// Sweeps do not overlap, so there are no correspondences to learn from.
     #[error("no two sweeps of one world within {0} m of each other")]
     NoPairs(f64),
-    /// Sweeps overlap, but none shows what another one shows.
+    /// Sweeps overlap in range, but none has a cell in common with another one.
     #[error("{0} pairs of sweeps side by side have no cell at the same spot: are the sweeps empty?")]
     NoMatches(usize),
     /// The network cannot be built or run.
     #[error(transparent)]
     Localizer(#[from] LocalizerError),
-    /// The training itself has failed.
+    /// The training itself failed.
     #[error(transparent)]
     Training(#[from] TrainingError),
-    /// The tensor library refused.
+    /// The tensor library failed.
     #[error("training: {}", perception::torch_error::first_line(.0))]
     Tensor(#[from] tch::TchError),
 }

@@ -1,4 +1,4 @@
-//! Features of a town's sweeps, computed once: the encoder is frozen, so only the head needs them again and again.
+//! Feature cache of a scene's sweeps: computed once, since the encoder is frozen and only the head is trained on them.
 
 use std::f64::consts::PI;
 use std::sync::Arc;
@@ -14,42 +14,42 @@ use super::turned_sweep::{CELLS, TurnedSweep};
 use localization::pgc::{Cell, SceneEncoder, SweepVoxels, VoxelBatch};
 use perception::train::{Prefetch, RunConfig};
 
-/// Sweeps of one forward pass.
+/// Number of sweeps of one forward pass.
 const BATCH: u64 = 4;
 
-/// How sweeps are changed before they are encoded.
+/// Augmentation of sweeps before they are encoded.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SweepAugmentation {
-    /// Copies of every sweep; the first is unchanged.
+    /// Number of copies of every sweep; the first is unchanged.
     pub copies: usize,
-    /// Largest turn of the other copies, radians: a car does not always stand along its lane.
+    /// Largest rotation of the other copies, radians: a car is not always aligned with its lane.
     pub turn_rad: f64,
-    /// Least share of points that is kept in the other copies.
+    /// Smallest share of points that is kept in the other copies, 0..=1.
     pub keep: f64,
 }
 
-/// Cached features of cells, with what they should be regressed to.
+/// Cached features of cells, with their regression targets.
 #[derive(Debug)]
 pub struct FeatureCache {
     /// `[N, cell_channels]`, half precision.
     pub cells: Tensor,
-    /// `[N]`: the sweep of each cell.
+    /// `[N]`: index of the sweep of each cell.
     pub sweep_of_cell: Tensor,
     /// `[N, 3]`: true world coordinates relative to the origin, metres.
     pub targets_m: Tensor,
-    /// `[N, 3]`: where the cell is in the sensor frame, metres.
+    /// `[N, 3]`: position of the cell in the sensor frame, metres.
     pub sensor_m: Tensor,
     /// `[S, sweep_channels]`, single precision.
     pub sweeps: Tensor,
     /// `[S]`: true poses.
     pub world_from_sensor: Vec<Isometry3<f64>>,
-    /// Middle of the sensor positions, metres.
+    /// Centre of the sensor positions, metres in the world.
     pub origin_m: [f64; 3],
 }
 
 impl FeatureCache {
-    /// Encodes every sweep of `list` once per copy, where and in which numbers `run` says; `progress` hears how many of how
-    /// many sweeps are done.
+    /// Encodes every sweep of `list` once per copy, on the device and in the precision of `run`; `progress` gets the
+    /// number of sweeps done and of all.
     ///
     /// # Errors
     /// [`LocalizerTrainError`] when a sweep cannot be read or encoded, or none has a pose.

@@ -1,15 +1,15 @@
-//! Clusters of places.
+//! k-means clusters of positions.
 
 use rand::SeedableRng;
 use rand::seq::IndexedRandom;
 use rand_chacha::ChaCha8Rng;
 
-/// Rounds until clusters hardly move any more.
+/// Number of rounds; clusters hardly change afterwards.
 const ROUNDS: usize = 25;
 
-/// Middles of up to `count` clusters and the cluster of every point. Fewer points than clusters: every point is one.
+/// Centres of up to `count` clusters and the cluster of every point. Fewer points than clusters: every point is one.
 ///
-/// Begins with points far from each other (k-means++, Arthur and Vassilvitskii 2007); the same for the same seed.
+/// Starts with points far from each other (k-means++, Arthur and Vassilvitskii 2007); same seed, same result.
 #[must_use]
 pub fn kmeans(points: &[[f64; 3]], count: usize, seed: u64) -> (Vec<[f64; 3]>, Vec<usize>) {
     let mut centres = spread(points, count.min(points.len()), seed);
@@ -35,7 +35,7 @@ fn spread(points: &[[f64; 3]], count: usize, seed: u64) -> Vec<[f64; 3]> {
     while centres.len() < count {
         let indices: Vec<usize> = (0..points.len()).collect();
         let weight = |&index: &usize| if centres.is_empty() { 1.0 } else { squares[index] };
-        // All weights are zero when points repeat: any will do then.
+        // All weights are zero when points repeat: any point is a valid choice then.
         let chosen = indices.choose_weighted(&mut rng, weight).copied().unwrap_or(0);
         let centre = points[chosen];
         squares.iter_mut().zip(points).for_each(|(least, point)| *least = least.min(square(&centre, point)));
@@ -68,7 +68,7 @@ mod tests {
     }
 
     #[test]
-    fn few_or_equal_points_are_no_trouble() {
+    fn few_or_equal_points_are_valid() {
         assert_eq!(kmeans(&[], 4, 0).0.len(), 0);
         assert_eq!(kmeans(&[[1.0; 3]; 9], 4, 0).0, [[1.0; 3]; 4]);
     }

@@ -1,4 +1,4 @@
-//! Training of localizers, in two stages as LightLoc does it: an encoder once, over many towns; then, for every new town,
+//! Training of localizers, in two stages as in LightLoc: an encoder once, over many scenes; then, for every new scene,
 //! only a head on the frozen encoder's features.
 
 mod contrast;

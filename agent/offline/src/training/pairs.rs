@@ -1,4 +1,4 @@
-//! Pairs of sweeps that see the same place, and which of their cells lie at the same spot.
+//! Pairs of overlapping sweeps, with the matches of their cells.
 
 use std::collections::HashMap;
 use std::f64::consts::PI;
@@ -13,29 +13,29 @@ use super::error::LocalizerTrainError;
 use super::sweep_store::{SweepStore, heading_rad, yaw};
 use localization::pgc::{Cell, SceneEncoderConfig, SweepVoxels};
 
-/// Sensors of a pair are at most so far apart in the plane, metres.
+/// Largest distance of the sensors of a pair in the plane, metres.
 pub(super) const PAIR_RANGE_M: f64 = 12.0;
-/// Cells closer than this are at the same spot, metres.
+/// Distance below which cells match, metres.
 const MATCH_M: f32 = 1.5;
-/// Probability that the partner comes from another drive, where there is one: other traffic, often the other way.
+/// Probability that the partner is of another drive, if there is one: other traffic, often the other direction.
 const OTHER_DRIVE: f64 = 0.7;
-/// Least share of points that is kept.
+/// Smallest share of points that is kept.
 const MIN_KEPT: f64 = 0.6;
-/// Cells of each sweep that take part in one loss.
+/// Number of cells of each sweep in one loss.
 const CELLS: usize = 640;
-/// Pairs that are tried before the data are given up.
+/// Number of pairs that are tried before an error is returned.
 const TRIES: usize = 200;
-/// Share of those that may be flat ground.
+/// Largest share of those cells that may be flat ground.
 const FLAT_SHARE: f64 = 0.25;
 
-/// Cells of one sweep of a pair that take part in the loss.
+/// Cells of one sweep of a pair that enter the loss.
 #[derive(Debug)]
 pub struct ChosenCells {
-    /// The sweep, turned at random.
+    /// The sweep, rotated at random.
     pub sweep: SweepVoxels,
-    /// `[n]` of its cells.
+    /// `[n]`: indices of its cells.
     pub rows: Vec<usize>,
-    /// `[n]` of where they are, metres in the world of the pair (its origin near the sensors).
+    /// `[n]`: positions, metres in the world of the pair (its origin near the sensors).
     pub places_m: Vec<[f32; 3]>,
     /// Rotation part of `sensor_from_world`, row-major.
     pub sensor_from_world: [f32; 9],
@@ -44,17 +44,17 @@ pub struct ChosenCells {
 /// Two sweeps of the same place.
 #[derive(Debug)]
 pub struct Pair {
-    /// The sweep whose cells are sought.
+    /// The sweep whose cells are the queries.
     pub anchor: ChosenCells,
-    /// The sweep that they are sought in.
+    /// The sweep whose cells are the candidates.
     pub partner: ChosenCells,
-    /// For each chosen cell of the anchor the place in `partner.rows` of the cell at the same spot.
+    /// For each chosen cell of the anchor the index in `partner.rows` of its match.
     pub matches: Vec<usize>,
     /// Heading of the partner relative to the anchor, radians.
     pub relative_yaw_rad: f64,
 }
 
-/// Makes pairs, each a function of the seed and its number.
+/// Generator of pairs, each a function of the seed and its number.
 #[derive(Debug, Clone)]
 pub struct PairMaker {
     store: Arc<SweepStore>,
@@ -66,10 +66,10 @@ pub struct PairMaker {
 }
 
 impl PairMaker {
-    /// Finds who sees the same place as whom.
+    /// Finds the overlapping sweeps of each sweep.
     ///
     /// # Errors
-    /// [`LocalizerTrainError::NoPairs`] when nobody does.
+    /// [`LocalizerTrainError::NoPairs`] when no two sweeps overlap.
     pub fn new(store: Arc<SweepStore>, config: SceneEncoderConfig, seed: u64) -> Result<Self, LocalizerTrainError> {
         let partners = partners(&store);
         let anchors: Vec<u32> = (0..)
@@ -92,8 +92,8 @@ impl PairMaker {
     /// Pair `number`.
     ///
     /// # Errors
-    /// [`LocalizerTrainError::NoMatches`] when sweeps that stand side by side show no cell at the same spot, for example
-    /// because they are empty.
+    /// [`LocalizerTrainError::NoMatches`] when neighbouring sweeps have no matching cells, for example because they are
+    /// empty.
     pub fn pair(&self, number: u64) -> Result<Pair, LocalizerTrainError> {
         let mut rng = ChaCha8Rng::seed_from_u64(self.seed);
         rng.set_stream(number);
@@ -115,7 +115,7 @@ impl PairMaker {
         let origin = self.store.sweeps[anchor].world_from_sensor.translation;
         let mut turned = |index: usize| {
             let stored = &self.store.sweeps[index];
-            // A car leans and pitches a little, whatever the maps say.
+            // A car rolls and pitches a little, whatever its recorded pose.
             let lean = UnitLean::random(rng);
             let turned_from_sensor = lean.isometry() * yaw(rng.random_range(-PI..PI));
             let keep = rng.random_range(MIN_KEPT..1.0);
@@ -130,7 +130,7 @@ impl PairMaker {
         let candidates = choose(anchor_sweep.cells(), CELLS, rng);
         let matched: Vec<(usize, usize)> =
             candidates.into_iter().filter_map(|cell| Some((cell, grid.nearest(anchor_places[cell])?))).collect();
-        // The partners of the anchor's cells, and others among which they are to be found.
+        // The partners of the anchor's cells, and others as negatives.
         let mut rows: Vec<usize> = matched.iter().map(|&(_, partner)| partner).collect();
         rows.extend(choose(partner_sweep.cells(), CELLS, rng));
         let mut seen = HashMap::new();
@@ -171,10 +171,10 @@ struct UnitLean([f64; 2]);
 
 impl UnitLean {
     /// Largest angle, radians.
-    const MOST_RAD: f64 = 0.03;
+    const MAX_RAD: f64 = 0.03;
 
     fn random(rng: &mut impl Rng) -> Self {
-        Self(std::array::from_fn(|_| rng.random_range(-Self::MOST_RAD..Self::MOST_RAD)))
+        Self(std::array::from_fn(|_| rng.random_range(-Self::MAX_RAD..Self::MAX_RAD)))
     }
 
     fn isometry(&self) -> Isometry3<f64> {
@@ -202,7 +202,7 @@ fn places(cells: &[Cell], world_from_sensor: &Isometry3<f64>) -> Vec<[f32; 3]> {
     cells.iter().map(place).collect()
 }
 
-/// Places by cubes of [`MATCH_M`].
+/// Index of positions by cubes of [`MATCH_M`].
 struct Grid<'a> {
     places_m: &'a [[f32; 3]],
     cubes: HashMap<[i32; 3], Vec<u32>>,
@@ -217,7 +217,7 @@ impl<'a> Grid<'a> {
         Self { places_m, cubes }
     }
 
-    /// The nearest place within [`MATCH_M`].
+    /// The nearest position within [`MATCH_M`].
     fn nearest(&self, point: [f32; 3]) -> Option<usize> {
         let [x, y, z] = cube(point);
         let mut best = (MATCH_M * MATCH_M, None);

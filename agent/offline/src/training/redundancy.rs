@@ -1,14 +1,13 @@
-//! Redundant Sample Downsampling (LightLoc, Li et al. 2025): sweeps that the head has learnt evenly need not be shown again
-//! and again.
+//! Redundant Sample Downsampling (LightLoc, Li et al. 2025): leaves out sweeps whose losses vary least.
 
-/// When sweeps are watched, and how many are left out.
+/// Windows of observation and share of sweeps that are left out.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RedundancyConfig {
     /// Share of each cluster's sweeps that is dropped at the end of a window.
     pub drop: f64,
-    /// The two windows, as shares of the training: from where to where losses are recorded.
+    /// The two windows in which losses are recorded, start and end as shares of the training.
     pub windows: [[f64; 2]; 2],
-    /// From here on all sweeps are used again, a share of the training.
+    /// Share of the training from which all sweeps are used again.
     pub all_from: f64,
 }
 
@@ -19,13 +18,13 @@ impl Default for RedundancyConfig {
     }
 }
 
-/// Passes that must have shown a sweep in a window before anything is known of its evenness.
+/// Number of passes over a sweep in a window that its variance is computed from, at least.
 const ENOUGH_PASSES: usize = 2;
 
-/// Which sweeps are used, with which weight.
+/// Selection and weights of the sweeps.
 ///
 /// It is not part of a checkpoint: a training that is resumed uses all sweeps again, and leaves none out before the end
-/// of a window that it has seen enough of itself.
+/// of a window that it has observed long enough itself.
 #[derive(Debug)]
 pub struct Redundancy {
     config: RedundancyConfig,
@@ -50,13 +49,13 @@ impl Redundancy {
         &self.weights
     }
 
-    /// Whether losses are of interest when this share of the training is done.
+    /// True if losses are recorded when this share of the training is done.
     #[must_use]
     pub fn watches(&self, share_done: f64) -> bool {
         self.config.windows.get(self.windows_done).is_some_and(|[from, to]| (*from..*to).contains(&share_done))
     }
 
-    /// Takes the losses of the cells of one pass: pairs of sweep and loss.
+    /// Records the losses of the cells of one pass: pairs of sweep and loss.
     pub fn record(&mut self, losses: &[(usize, f32)]) {
         let mut by_sweep = vec![Vec::new(); self.weights.len()];
         losses.iter().for_each(|&(sweep, loss)| by_sweep[sweep].push(loss));
@@ -66,13 +65,13 @@ impl Redundancy {
         }
     }
 
-    /// Whether sweeps that were left out are to come back now, without waiting for the end of a pass.
+    /// True if sweeps that were left out are to be used again now, without waiting for the end of a pass.
     #[must_use]
     pub fn is_time_for_all(&self, share_done: f64) -> bool {
         share_done >= self.config.all_from && self.weights.iter().any(|&weight| weight != 1.0)
     }
 
-    /// Decides at the end of a pass. Says whether the set of used sweeps has changed.
+    /// Updates the selection at the end of a pass. True if it has changed.
     pub fn advance(&mut self, share_done: f64) -> bool {
         let is_over = |redundancy: &Self| {
             redundancy.config.windows.get(redundancy.windows_done).is_some_and(|[_, to]| share_done >= *to)
@@ -97,8 +96,8 @@ impl Redundancy {
         false
     }
 
-    /// In each cluster the sweeps with the lowest variance of their losses go; the others stand for them. Where nothing is
-    /// known of a sweep's variance it stays, however many that leaves.
+    /// Leaves out the sweeps with the lowest variance of their losses in each cluster; the weights of the others grow.
+    /// A sweep of unknown variance stays, however many that leaves.
     fn drop_most_even(&mut self) {
         let classes = self.class_of_sweep.iter().max().map_or(0, |class| class + 1);
         for class in 0..classes {
@@ -118,7 +117,7 @@ impl Redundancy {
 
 fn variance(values: &[f32]) -> f32 {
     if values.len() < ENOUGH_PASSES {
-        // Nothing is known of its evenness, so it stays.
+        // Its variance is unknown, so it stays.
         return f32::MAX;
     }
     let mean = values.iter().sum::<f32>() / values.len() as f32;
@@ -130,7 +129,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_most_even_quarter_goes_and_the_others_stand_for_it() {
+    fn the_most_even_quarter_is_left_out_and_the_others_gain_weight() {
         let mut redundancy = Redundancy::new(RedundancyConfig::default(), vec![0; 8]);
         assert!(redundancy.watches(0.2) && !redundancy.watches(0.3));
         for pass in 0..3 {
@@ -149,7 +148,7 @@ mod tests {
     }
 
     #[test]
-    fn sweeps_that_were_never_watched_stay() {
+    fn sweeps_that_were_never_observed_stay() {
         let mut redundancy = Redundancy::new(RedundancyConfig::default(), vec![0, 0, 0, 0, 1]);
         redundancy.record(&[(0, 1.0), (1, 1.0)]);
         redundancy.record(&[(0, 1.0), (1, 2.0)]);
@@ -159,7 +158,7 @@ mod tests {
     }
 
     #[test]
-    fn one_pass_tells_nothing_of_evenness() {
+    fn one_pass_gives_no_variance() {
         let mut redundancy = Redundancy::new(RedundancyConfig::default(), vec![0; 8]);
         redundancy.record(&std::array::from_fn::<_, 8, _>(|sweep| (sweep, sweep as f32)));
         redundancy.advance(0.25);

@@ -1,4 +1,4 @@
-//! How good a head is, on cached features of sweeps it was not trained on.
+//! Validation of a head on cached features of sweeps that it was not trained on.
 
 use serde::Serialize;
 use support::statistics;
@@ -24,14 +24,14 @@ pub struct SceneAccuracy {
     pub pose_p50_deg: f64,
     /// Share of sweeps with a translation error under 3 m; those without a pose are failures.
     pub success_3m: f64,
-    /// Share under 1 m.
+    /// Share of sweeps with a translation error under 1 m.
     pub success_1m: f64,
 }
 
 /// Regresses and solves every sweep of `cache`.
 ///
 /// # Errors
-/// The tensor library's.
+/// Those of the tensor library.
 pub(super) fn validate(
     head: &SceneHead,
     cache: &FeatureCache,
@@ -41,7 +41,7 @@ pub(super) fn validate(
         let logits = head.classify(&cache.sweeps, false)?.f_index_select(0, &cache.sweep_of_cell)?;
         head.regress(&head.normalise(&cache.cells)?, &logits, kind)
     })?;
-    // Coordinates are relative to the origin of the head's town.
+    // Coordinates are relative to the origin of the head's scene.
     let origin = head.config().origin_m;
     let moved: [f32; 3] = std::array::from_fn(|axis| (cache.origin_m[axis] - origin[axis]) as f32);
     let targets = &cache.targets_m + Tensor::f_from_slice(&moved)?.f_to_device(cache.targets_m.device())?;
@@ -67,8 +67,8 @@ pub(super) fn validate(
             epsilon_m: epsilon[rows].to_vec(),
             origin_m: head.config().origin_m,
         };
-        let again = SweepCells { features, sensor_m: coordinates.sensor_m.clone() };
-        let found = search.run(&coordinates, &again, &mut SearchTimes::default())?;
+        let refinement_cells = SweepCells { features, sensor_m: coordinates.sensor_m.clone() };
+        let found = search.run(&coordinates, &refinement_cells, &mut SearchTimes::default())?;
         let (metres, degrees) = found.map_or((f64::INFINITY, 180.0), |found| {
             let error = PoseError::between(&found.world_from_sensor.into(), &(*truth).into());
             (error.distance_m, error.angle_deg)

@@ -12,15 +12,15 @@ use super::error::LocalizerTrainError;
 use localization::pgc::{SceneEncoderConfig, SweepVoxels};
 use perception::train::{DataListing, Prefetch};
 
-/// Units of stored coordinates, metres.
+/// Unit of stored coordinates, metres.
 const UNIT_M: f32 = 0.01;
 
 /// One sweep.
 #[derive(Debug, Clone)]
 pub struct StoredSweep {
-    /// Which world it was made in: place of its folder on the command line.
+    /// World that it was recorded in: index of its folder on the command line.
     pub world: usize,
-    /// Which drive it belongs to.
+    /// Index of its drive.
     pub drive: usize,
     /// True pose.
     pub world_from_sensor: Isometry3<f64>,
@@ -41,8 +41,8 @@ impl StoredSweep {
         self.points.iter().map(|point| point.map(|axis| f32::from(axis) * UNIT_M))
     }
 
-    /// The sweep as another sensor would have it that stands `turned_from_sensor` differently: voxels of the turned
-    /// points, each kept with a probability.
+    /// The voxels of the same sweep for a sensor in another orientation, `turned_from_sensor`; each point is kept with
+    /// a probability.
     pub fn turned_voxels(
         &self,
         turned_from_sensor: &Isometry3<f64>,
@@ -51,33 +51,32 @@ impl StoredSweep {
         config: &SceneEncoderConfig,
     ) -> SweepVoxels {
         let turn: Isometry3<f32> = turned_from_sensor.cast();
-        // 32 decisions from one draw of the generator would be faster still; this is not what takes the time.
+        // 32 decisions from one draw of the generator would be faster still; this does not dominate the time.
         let kept = self.points().filter(|_| keep >= 1.0 || rng.random_bool(keep));
         SweepVoxels::new(kept.map(|[x, y, z]| (turn * nalgebra::Point3::new(x, y, z)).into()), config)
     }
 }
 
-/// A turn about the vertical, and where the sensor then stands.
+/// A rotation about the vertical.
 #[must_use]
 pub(super) fn yaw(angle_rad: f64) -> Isometry3<f64> {
     Isometry3::from_parts(Translation3::identity(), UnitQuaternion::from_axis_angle(&Vector3::z_axis(), angle_rad))
 }
 
-/// Heading of what stands at a pose, radians.
+/// Heading of a pose, radians.
 #[must_use]
 pub(super) fn heading_rad(world_from_sensor: &Isometry3<f64>) -> f64 {
     let ahead = world_from_sensor.rotation * Vector3::x();
     ahead.y.atan2(ahead.x)
 }
 
-/// Where sweeps with true poses lie on disk. Each folder is one world: poses in different folders have nothing to do with
-/// each other.
+/// Paths of sweeps with true poses on disk. Each folder is one world: poses in different folders are unrelated.
 #[derive(Debug)]
 pub struct SweepList {
     places: Vec<Place>,
     sha256: String,
     problems: Vec<String>,
-    /// Of those read so far.
+    /// Indices of the sweeps without a pose among those read so far.
     without_pose: Mutex<BTreeSet<usize>>,
 }
 
@@ -118,7 +117,7 @@ impl SweepList {
         Ok(Self { places, sha256, problems, without_pose: Mutex::default() })
     }
 
-    /// Which data it is, and what of it has been found to be of no use so far.
+    /// Identity of the data, and the part of it that proved unusable so far.
     #[must_use]
     pub fn data(&self) -> DataListing {
         let without_pose = self.without_pose.lock().unwrap_or_else(PoisonError::into_inner).len();
@@ -130,7 +129,7 @@ impl SweepList {
         let total = self.places.len();
         if total > count {
             let mut index = 0;
-            // Sweep k of n stays where the running share passes a whole number.
+            // Sweep k of n stays if the running share passes an integer there.
             self.places.retain(|_| {
                 index += 1;
                 index * count / total > (index - 1) * count / total
@@ -144,13 +143,13 @@ impl SweepList {
         self.places.len()
     }
 
-    /// Whether there is none.
+    /// True if there is none.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.places.is_empty()
     }
 
-    /// Reads one sweep, points within `range_m` of the sensor; nothing when its pose is not known.
+    /// Reads one sweep, points within `range_m` of the sensor; `None` if its pose is unknown.
     ///
     /// # Errors
     /// [`LocalizerTrainError::Read`] names the file.
@@ -172,7 +171,7 @@ impl SweepList {
 pub struct SweepStore {
     /// The sweeps, drive after drive.
     pub sweeps: Vec<StoredSweep>,
-    /// Which data it is.
+    /// Identity of the data.
     pub data: DataListing,
 }
 

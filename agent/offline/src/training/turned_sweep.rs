@@ -1,4 +1,4 @@
-//! A sweep as a network for one town learns from it.
+//! A sweep, augmented for the training of a network of one scene.
 
 use nalgebra::Isometry3;
 use rand::Rng;
@@ -7,20 +7,20 @@ use super::pairs::choose;
 use super::sweep_store::StoredSweep;
 use localization::pgc::{SceneEncoderConfig, SweepVoxels};
 
-/// Cells of a sweep that are learnt from.
+/// Number of cells of a sweep that are training examples.
 pub(super) const CELLS: usize = 400;
 
-/// A sweep, turned and decimate out.
+/// A sweep, rotated and subsampled.
 pub(super) struct TurnedSweep {
     pub(super) voxels: SweepVoxels,
-    /// Which of its cells are learnt from.
+    /// Indices of the cells that are training examples.
     pub(super) rows: Vec<usize>,
     /// Pose of the turned sensor.
     pub(super) world_from_sensor: Isometry3<f64>,
 }
 
 impl TurnedSweep {
-    /// The sweep of a sensor that stands `turned_from_sensor`, each point kept with a probability.
+    /// The sweep of a sensor in the orientation `turned_from_sensor`, each point kept with a probability.
     pub(super) fn new(
         stored: &StoredSweep,
         turned_from_sensor: &Isometry3<f64>,

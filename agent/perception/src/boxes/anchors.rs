@@ -1,19 +1,19 @@
-//! Prior boxes of the head.
+//! Anchors: prior boxes of the head.
 
 use crate::model_config::{AnchorConfig, DetectorConfig};
 
-/// The anchors of a head: a regular lattice, the same few boxes at every point of it.
+/// Anchors of a head: a regular grid with the same boxes at every point.
 ///
 /// Anchor `a` of row `r` and column `c` has the index `(r * W + c) * A + a`: the order H, W, anchor of the reference.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Anchors {
-    /// Columns of the lattice, metres.
+    /// Columns of the grid, metres.
     pub x_m: Vec<f64>,
-    /// Rows of the lattice, metres.
+    /// Rows of the grid, metres.
     pub y_m: Vec<f64>,
     /// Centre height, metres.
     pub z_m: f64,
-    /// Length, width, height, metres.
+    /// Length, width and height, metres.
     pub size_lwh_m: [f64; 3],
     /// Headings, radians.
     pub yaws_rad: Vec<f64>,
@@ -29,9 +29,9 @@ impl Anchors {
 
     /// Anchors over an area with `grid` pillars (x, y, z) of which each cell of the head covers `stride` along an axis.
     ///
-    /// As in the reference they spread evenly from one pillar inside the lower edge to one inside the upper. For stride
-    /// 2 these are the centres of the cells; for stride 4 they lie 1.6046 m apart on cells of 1.6 m. Trained weights
-    /// depend on it, so it is kept.
+    /// As in the reference they are evenly spaced from one pillar inside the lower edge to one inside the upper. For
+    /// stride 2 these are the centres of the cells; for stride 4 they lie 1.6046 m apart on cells of 1.6 m. Trained
+    /// weights depend on it, so it is kept.
     #[must_use]
     pub fn new(
         lidar_range_m: [f64; 6],
@@ -53,13 +53,13 @@ impl Anchors {
         }
     }
 
-    /// Anchors in all.
+    /// Number of anchors.
     #[must_use]
     pub fn len(&self) -> usize {
         self.x_m.len() * self.y_m.len() * self.yaws_rad.len()
     }
 
-    /// Whether there is none.
+    /// True if there is none.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.len() == 0

@@ -1,10 +1,10 @@
-//! From what the head says to boxes.
+//! Decoding of boxes from the output of the head.
 
 use protocol::Box3d;
 
 use crate::boxes::anchors::Anchors;
 
-/// Why the output of a head cannot be decoded.
+/// The output of a head does not fit its anchors.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("head output {field} has {found} values, {anchors} anchors need {expected}")]
 pub struct DecodeError {
@@ -19,19 +19,19 @@ pub struct DecodeError {
 pub struct Decoded {
     /// Index of the anchor, see [`Anchors`].
     pub anchor: usize,
-    /// Sigmoid of its logit.
+    /// Sigmoid of its logit, 0..1.
     pub score: f32,
-    /// The box in the frame of the map.
+    /// The box in the frame of the BEV feature map.
     pub box3d: Box3d,
 }
 
-/// The largest exponent of a size that is decoded: a box of `e^8` times the anchor is no vehicle, but a finite number.
+/// Largest exponent of a size that is decoded: a box of `e^8` times the anchor is no vehicle, but a finite number.
 const MAX_LOG_SIZE: f32 = 8.0;
 
 /// Decodes the anchors whose score is above `threshold`; the others, nearly all, cost one comparison each.
 ///
-/// x and y are offsets in diagonals of the anchor, z in its heights; sizes are logarithms; yaw is added and not wrapped.
-/// Values that are not finite are no detection.
+/// x and y are offsets in diagonals of the anchor, z in its heights; sizes are logarithms; yaw is added and not
+/// wrapped. Values that are not finite give no detection.
 ///
 /// # Shapes
 /// - `scores`: `[A, H, W]` logits
@@ -48,7 +48,7 @@ pub fn decode(scores: &[f32], offsets: &[f32], anchors: &Anchors, threshold: f32
     check("offsets", offsets.len(), anchors.len() * 7)?;
     let per_cell = anchors.yaws_rad.len();
     let cells = anchors.len() / per_cell.max(1);
-    // Sigmoid rises: a logit clearly below the threshold's needs no exponential.
+    // The sigmoid is increasing: a logit clearly below the threshold's needs no exponential.
     let lowest = logit(threshold) - 1e-3;
     let mut decoded = Vec::new();
     for cell in 0..cells {
@@ -105,7 +105,7 @@ mod tests {
     }
 
     #[test]
-    fn only_what_is_above_the_threshold_is_decoded() {
+    fn only_scores_above_the_threshold_are_decoded() {
         let anchors = anchors();
         let cells = anchors.len() / 2;
         let mut scores = vec![-5.0; anchors.len()];
@@ -130,7 +130,7 @@ mod tests {
     }
 
     #[test]
-    fn a_map_of_another_size_is_refused() {
+    fn a_map_of_another_size_is_rejected() {
         let message = decode(&[0.0; 3], &[], &anchors(), 0.5).unwrap_err().to_string();
         assert!(message.contains("scores has 3") && message.contains("32"), "{message}");
     }

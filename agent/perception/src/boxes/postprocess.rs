@@ -1,4 +1,4 @@
-//! From decoded boxes of one or more agents to the detections that count.
+//! Post-processing: from decoded boxes of one or more agents to detections.
 
 use nalgebra::{Isometry3, Point3};
 use protocol::rotated_iou::Polygon;
@@ -9,25 +9,26 @@ use crate::boxes::decode::Decoded;
 use crate::boxes::nms::rotated_nms;
 use crate::model_config::DetectorConfig;
 
-/// Boxes at or below this score are not judged. It holds for every method: a box that a vehicle sends counts as one that
-/// the ego finds in a fused map.
+/// Score at or below which boxes are not evaluated. It is the same for every method: for a box that a vehicle sends and
+/// for one that the ego detects in a fused feature map.
 pub const SCORE_THRESHOLD: f32 = 0.1;
 
-/// Limits of the clean-up, with the reference's numbers as defaults but for the score, which is that of all methods here.
+/// Limits of post-processing. Defaults are those of the reference, except the score threshold, which is common to all
+/// methods here.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct PostprocessConfig {
-    /// Anchors at or below this score are no candidates.
+    /// Score at or below which anchors are no candidates.
     pub score_threshold: f32,
-    /// A box goes when a better one overlaps it more, IoU from above.
+    /// IoU seen from above; a box is removed if a better one overlaps it more.
     pub nms_iou: f64,
-    /// Candidates that suppression looks at.
+    /// Largest number of candidates of the suppression.
     pub nms_max_candidates: usize,
-    /// Boxes with a longer axis-aligned side go, metres: no vehicle is so long unless it stands askew.
+    /// Longest axis-aligned side of a box, metres; longer ones are removed.
     pub max_extent_m: f64,
-    /// All corners lie between these heights, metres in the output frame.
+    /// Heights that all corners must lie between, metres in the output frame.
     pub z_range_m: [f64; 2],
-    /// All corners lie within: x, y of the lower, then of the upper corner, metres in the output frame.
+    /// Area that all corners must lie in: x, y of the lower, then of the upper corner, metres in the output frame.
     pub keep_range_m: [f64; 4],
 }
 
@@ -52,7 +53,7 @@ impl PostprocessConfig {
         Self { z_range_m: [z_low, z_high], keep_range_m: [x_low, y_low, x_high, y_high], ..Self::default() }
     }
 
-    /// For boxes that another vehicle will merge: what counts as within range is the receiver's to say.
+    /// For boxes that another vehicle will merge: the receiver applies its own range.
     #[must_use]
     pub fn for_late_fusion(config: &DetectorConfig) -> Self {
         Self { keep_range_m: [f64::MIN, f64::MIN, f64::MAX, f64::MAX], ..Self::for_detector(config) }
@@ -66,22 +67,22 @@ pub struct Candidate {
     pub corners: [[f64; 3]; 8],
     /// Confidence, 0..1.
     pub score: f32,
-    /// Index of the agent it comes from.
+    /// Index of its agent.
     pub agent: usize,
 }
 
-/// Boxes that one agent decoded, and how its frame lies in that of the output.
+/// Decoded boxes of one agent, and the transform of its frame to that of the output.
 #[derive(Debug, Clone, Copy)]
 pub struct AgentBoxes<'a> {
-    /// Its decoded boxes, above the score threshold.
+    /// Decoded boxes above the score threshold.
     pub boxes: &'a [Decoded],
-    /// Takes points of the boxes' frame to the output's.
+    /// Transforms points of the boxes' frame to the output frame.
     pub output_from_agent: Isometry3<f64>,
 }
 
-/// The whole chain: project, drop what is no vehicle, suppress, drop what reaches out of the range.
+/// The whole chain: projects, removes boxes of implausible size, suppresses, removes boxes out of range.
 ///
-/// Returns the detections by falling score.
+/// Returns the detections by descending score.
 #[must_use]
 pub fn postprocess(agents: &[AgentBoxes<'_>], config: &PostprocessConfig) -> Vec<Candidate> {
     let mut candidates: Vec<Candidate> =
@@ -101,7 +102,8 @@ fn project<'a>(agent: usize, boxes: &'a AgentBoxes<'_>) -> impl Iterator<Item = 
     })
 }
 
-/// Size and height of a vehicle: no side over the limit, not flat, all corners between the heights.
+/// True if the size and height are plausible for a vehicle: no side over the limit, not flat, all corners between the
+/// heights.
 #[must_use]
 pub fn is_vehicle_sized(corners: &[[f64; 3]; 8], config: &PostprocessConfig) -> bool {
     let [x, y, z] = bounds(corners);
@@ -110,7 +112,7 @@ pub fn is_vehicle_sized(corners: &[[f64; 3]; 8], config: &PostprocessConfig) -> 
     sized && z[0] >= config.z_range_m[0] && z[1] <= config.z_range_m[1]
 }
 
-/// Rotated suppression on the footprints, by falling score.
+/// Rotated non-maximum suppression on the footprints, by descending score.
 #[must_use]
 pub fn suppress(candidates: &[Candidate], config: &PostprocessConfig) -> Vec<Candidate> {
     let polygons: Vec<Polygon> = candidates.iter().map(|candidate| footprint(&candidate.corners)).collect();
@@ -119,14 +121,14 @@ pub fn suppress(candidates: &[Candidate], config: &PostprocessConfig) -> Vec<Can
     kept.into_iter().map(|index| candidates[index].clone()).collect()
 }
 
-/// Whether all corners lie within x, y of the lower and the upper corner of `range_m`, edges included.
+/// True if all corners lie within x, y of the lower and the upper corner of `range_m`, edges included.
 #[must_use]
 pub fn is_within(corners: &[[f64; 3]; 8], range_m: [f64; 4]) -> bool {
     let [x_low, y_low, x_high, y_high] = range_m;
     corners.iter().all(|&[x, y, _]| (x_low..=x_high).contains(&x) && (y_low..=y_high).contains(&y))
 }
 
-/// The footprint of a box: its first four corners from above.
+/// Footprint of a box: its first four corners, seen from above.
 #[must_use]
 pub fn footprint(corners: &[[f64; 3]; 8]) -> Polygon {
     Polygon::new(std::array::from_fn(|corner| [corners[corner][0], corners[corner][1]]))
@@ -135,7 +137,7 @@ pub fn footprint(corners: &[[f64; 3]; 8]) -> Polygon {
 /// The upright box of eight corners.
 ///
 /// Centre and sizes are means over the corners and the parallel edges. The heading is the direction of the sum of the
-/// four edges along the length: unlike a mean of four angles it does not break at half a turn.
+/// four edges along the length: unlike a mean of four angles it is continuous at half a turn.
 #[must_use]
 pub fn corners_to_box(corners: &[[f64; 3]; 8]) -> Box3d {
     let center_m = std::array::from_fn(|axis| corners.iter().map(|corner| corner[axis]).sum::<f64>() / 8.0);
@@ -149,7 +151,7 @@ pub fn corners_to_box(corners: &[[f64; 3]; 8]) -> Box3d {
 }
 
 impl Candidate {
-    /// The detection that goes out. `source` names the CAV where one alone saw it.
+    /// The published detection. `source` is the CAV if one alone detected it.
     #[must_use]
     pub fn detection(&self, source: Option<CavId>) -> Detection {
         Detection { box3d: corners_to_box(&self.corners), score: self.score, source }
@@ -195,7 +197,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_vehicle_goes() {
+    fn implausible_boxes_are_removed() {
         let long = Box3d { size_m: [7.0, 2.0, 1.5], heading_rad: 0.0, ..CAR };
         let high = Box3d { center_m: [10.0, 2.0, 0.5], ..CAR };
         let flat = Box3d { size_m: [4.0, 2.0, 0.0], ..CAR };

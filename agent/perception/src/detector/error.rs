@@ -1,4 +1,4 @@
-//! What can go wrong in a detector.
+//! Errors of a detector.
 
 use tch::TchError;
 
@@ -7,19 +7,19 @@ use crate::model_config::ConfigError;
 use crate::torch_error::first_line;
 use crate::weights::WeightsError;
 
-/// Why a detector cannot be made or a map not be read by it.
+/// Error of loading a detector or of running it.
 #[derive(Debug, thiserror::Error)]
 pub enum DetectorError {
-    /// The weights are not readable or made for something else.
+    /// The weights are not readable or made for another model.
     #[error(transparent)]
     Weights(#[from] WeightsError),
-    /// The configuration is not one of a network.
+    /// The configuration does not describe a network.
     #[error(transparent)]
     Config(#[from] ConfigError),
-    /// A map has not the shape of this detector's.
+    /// A feature map does not have the shape of this detector's.
     #[error("{what} is {found:?}, this detector's is {expected:?} (channels, height, width)")]
     Shape {
-        /// Which map.
+        /// Name of the feature map.
         what: &'static str,
         /// Its shape.
         found: Vec<i64>,
@@ -29,7 +29,7 @@ pub enum DetectorError {
     /// The output of the head does not fit the anchors.
     #[error(transparent)]
     Decode(#[from] DecodeError),
-    /// The tensor library refused.
+    /// The tensor library failed.
     #[error("tensor library: {}", first_line(.0))]
     Tensor(#[from] TchError),
 }

@@ -1,4 +1,4 @@
-//! The detector for inference: one sweep in, the map for the air and boxes out.
+//! Detector for inference: from one sweep to the transmitted feature map and boxes.
 
 mod error;
 mod output;
@@ -31,8 +31,8 @@ use crate::weights::Weights;
 
 /// A trained PointPillars network in its fastest form, for one sweep at a time.
 ///
-/// The same sweep gives the same bits, whoever computes it, as long as the number of torch threads is the same
-/// (`tch::set_num_threads`; 1 is what live and offline runs use).
+/// The same sweep gives the same bits in any process, as long as the number of torch threads is the same
+/// (`tch::set_num_threads`; live and offline runs use 1).
 #[derive(Debug)]
 pub struct Detector {
     config: DetectorConfig,
@@ -71,7 +71,7 @@ impl Detector {
         Ok(Self { sha256: weights.sha256().to_owned(), ..Self::from_network(pillars) })
     }
 
-    /// Takes over a network on the CPU, trained or not; its norms are folded into the convolutions.
+    /// Uses a network on the CPU, trained or not; its norms are folded into the convolutions.
     #[must_use]
     pub fn from_network(network: PointPillars) -> Self {
         let lattice = *network.lattice();
@@ -93,45 +93,47 @@ impl Detector {
         })
     }
 
-    /// The numbers it was built from.
+    /// Configuration that it was built from.
     #[must_use]
     pub fn config(&self) -> &DetectorConfig {
         &self.config
     }
 
-    /// SHA-256 of its weights file; empty when it was not read from one.
+    /// SHA-256 of its weights file; empty if it was not read from one.
     #[must_use]
     pub fn sha256(&self) -> &str {
         &self.sha256
     }
 
-    /// The same for the wire, where it tells whose maps belong together; all zeros when it was not read from a file.
+    /// Hash of the weights for the wire, where it identifies compatible feature maps; all zeros if it was not read from
+    /// a file.
     #[must_use]
     pub fn model_hash(&self) -> ModelHash {
         self.sha256.parse().unwrap_or(ModelHash([0; 32]))
     }
 
-    /// The lattice of its maps.
+    /// BEV grid of its feature maps.
     #[must_use]
     pub fn grid(&self) -> BevGrid {
         self.config.feature_grid()
     }
 
-    /// Channels, height and width of its maps, as they are fused.
+    /// Channels, height and width of its feature maps, as they are fused.
     #[must_use]
     pub fn map_shape(&self) -> [i64; 3] {
         let grid = self.grid();
         [self.config.feature_channels(), i64::from(grid.height), i64::from(grid.width)]
     }
 
-    /// The same as they are transmitted: with a compressor, of the code.
+    /// Channels, height and width as transmitted: with a compressor, of the code.
     #[must_use]
     pub fn sent_shape(&self) -> [i64; 3] {
         let [_, height, width] = self.map_shape();
         [self.config.sent_channels(), height, width]
     }
 
-    /// Channels of the map that the code stands for, where there is a compressor: [`BevFeatures::code_of`] of its messages.
+    /// Channels of the feature map that the code represents, if there is a compressor: [`BevFeatures::code_of`] of its
+    /// messages.
     #[must_use]
     pub fn code_of(&self) -> Option<u32> {
         self.compressor.as_ref().and_then(|_| u32::try_from(self.config.feature_channels()).ok())
@@ -139,11 +141,11 @@ impl Detector {
 
     /// Encodes one sweep.
     ///
-    /// Points outside the area, on the own body or not finite do not count; a sweep without any other gives the map of
-    /// an empty world.
+    /// Points outside the area, on the vehicle's own body or not finite are ignored; a sweep without any other gives
+    /// the feature map of an empty scene.
     ///
     /// # Errors
-    /// The tensor library's.
+    /// Those of the tensor library.
     pub fn encode(&mut self, cloud: &PointCloud) -> Result<Encoded, DetectorError> {
         let crop = self.crop;
         self.encode_within(&crop, cloud)
@@ -151,17 +153,17 @@ impl Detector {
 
     /// Encodes the points of several vehicles in one frame, for early fusion.
     ///
-    /// Nothing is cut out around the origin: others see the body that stands there, and it is to be found. Each sweep's
-    /// own body must have been cut out in its own frame, see [`Crop::without_own_body`].
+    /// Nothing is removed around the origin: other vehicles measure the vehicle there, and it is to be detected. Each
+    /// sweep's own body must have been removed in its own frame, see [`Crop::without_own_body`].
     ///
     /// # Errors
-    /// The tensor library's.
+    /// Those of the tensor library.
     pub fn encode_merged(&mut self, cloud: &PointCloud) -> Result<Encoded, DetectorError> {
         let crop = self.crop.range_only();
         self.encode_within(&crop, cloud)
     }
 
-    /// Which points it looks at.
+    /// Crop of its input.
     #[must_use]
     pub fn crop(&self) -> &Crop {
         &self.crop
@@ -192,30 +194,31 @@ impl Detector {
         Ok(Encoded { features, points: self.cropped.len(), pillars: pillars.len(), times: times.into_timings() })
     }
 
-    /// The transmitted part of an encoded map `[1, C, H, W]`: the compressor's code `[1, C / ratio, H, W]`; the map itself where
-    /// the configuration has none.
+    /// The transmitted form of an encoded feature map `[1, C, H, W]`: the compressor's code `[1, C / ratio, H, W]`; the
+    /// feature map itself if the configuration has no compressor.
     ///
     /// # Errors
-    /// [`DetectorError::Shape`] when there is a compressor and the map is not one of this detector's.
+    /// [`DetectorError::Shape`] if there is a compressor and the feature map is not of this detector.
     pub fn squeezed(&self, features: &Tensor) -> Result<Tensor, DetectorError> {
         let Some(compressor) = &self.compressor else { return Ok(features.shallow_clone()) };
         let map = one_map(features, self.map_shape())?;
         Ok(tch::no_grad(|| compressor.encode(&map, false).f_contiguous())?)
     }
 
-    /// What head and fusion have learnt to read, `[1, C, H, W]`, from what was transmitted.
+    /// Input of head and fusion, `[1, C, H, W]`, from a transmitted tensor.
     ///
     /// # Errors
-    /// [`DetectorError::Shape`] when there is a compressor and it is no code of this detector's.
+    /// [`DetectorError::Shape`] if there is a compressor and the tensor is not a code of this detector.
     pub fn widened(&self, sent: &Tensor) -> Result<Tensor, DetectorError> {
         let Some(compressor) = &self.compressor else { return Ok(sent.shallow_clone()) };
         let code = one_map(sent, self.sent_shape())?;
         Ok(tch::no_grad(|| compressor.decode(&code, false).f_contiguous())?)
     }
 
-    /// What is left of an encoded map `[1, C, H, W]` behind the compressor: compressed and expanded again.
+    /// An encoded feature map `[1, C, H, W]` after the compressor: compressed and expanded again.
     ///
-    /// Maps are encoded and kept without: whoever reads one that was not transmitted calls this once.
+    /// Feature maps are encoded and stored without it: a caller that uses one that was not transmitted applies this
+    /// once.
     ///
     /// # Errors
     /// As [`Self::squeezed`].
@@ -223,24 +226,24 @@ impl Detector {
         self.widened(&self.squeezed(features)?)
     }
 
-    /// The map `[1, C, H, W]` of a message, widened where it is a code, and zero where nothing was sent.
+    /// The feature map `[1, C, H, W]` of a message, expanded if it is a code, and zero where nothing was sent.
     ///
     /// # Errors
-    /// [`DetectorError::Shape`] when it is not one of this detector's; its lattice is the caller's affair.
+    /// [`DetectorError::Shape`] if it is not of this detector; the caller checks its BEV grid.
     pub fn received(&self, message: &DecodedFeatures) -> Result<Tensor, DetectorError> {
         let DecodedFeatures { features: BevFeatures { grid, channels, values, .. }, sent } = message;
         let [expected, height, width] = self.sent_shape();
         let found = [*channels, grid.height, grid.width].map(i64::from);
         if found != self.sent_shape() || values.len() as i64 != expected * height * width {
             return Err(DetectorError::Shape {
-                what: "map of a message",
+                what: "feature map of a message",
                 found: found.into(),
                 expected: self.sent_shape(),
             });
         }
         let widened = self.widened(&Tensor::f_from_slice(values)?.f_view([1, expected, height, width])?)?;
         match (sent, &self.compressor) {
-            // Widening spreads what was sent to its neighbours, and the bias everywhere.
+            // The expansion spreads the sent cells to their neighbours, and the bias everywhere.
             (Some(sent), Some(_)) => {
                 let sent = Tensor::f_from_slice(sent)?.f_to_kind(Kind::Float)?.f_view([1, 1, height, width])?;
                 Ok(widened.f_mul(&sent)?)
@@ -249,19 +252,19 @@ impl Detector {
         }
     }
 
-    /// Scores, offsets and confidence of a map `[1, C, H, W]` or `[C, H, W]`, own or fused.
+    /// Scores, offsets and confidence of a feature map `[1, C, H, W]` or `[C, H, W]`, own or fused.
     ///
     /// # Errors
-    /// [`DetectorError::Shape`] when the map is not one of this detector's.
+    /// [`DetectorError::Shape`] if the feature map is not of this detector.
     pub fn heads(&self, features: &Tensor) -> Result<Heads, DetectorError> {
         let map = one_map(features, self.map_shape())?;
         tch::no_grad(|| Heads::new(&self.head.forward(&map)?))
     }
 
-    /// Boxes above a score, in the frame of the vehicle whose map it is, not yet suppressed.
+    /// Boxes above a score, in the frame of the feature map's vehicle, not yet suppressed.
     ///
     /// # Errors
-    /// [`DetectorError::Decode`] when the heads are of another detector.
+    /// [`DetectorError::Decode`] if the heads are of another detector.
     pub fn boxes(&self, heads: &Heads, score_threshold: f32) -> Result<Vec<Decoded>, DetectorError> {
         let mut boxes = decode(&heads.scores, &heads.offsets, &self.anchors, score_threshold)?;
         if self.config.y_axis == YAxis::Right {
@@ -272,20 +275,20 @@ impl Detector {
         Ok(boxes)
     }
 
-    /// The message of the transmitted map, see [`Self::squeezed`].
+    /// Message of a feature map in its transmitted form, see [`Self::squeezed`].
     ///
     /// # Errors
-    /// [`DetectorError::Shape`] when the tensor is not one of this detector.
+    /// [`DetectorError::Shape`] if the tensor is not of this detector.
     pub fn to_message(&self, sent: &Tensor) -> Result<BevFeatures, DetectorError> {
         let sent = one_map(sent, self.sent_shape())?;
         let channels = self.config.sent_channels() as u32;
         Ok(BevFeatures { grid: self.grid(), channels, code_of: self.code_of(), values: flat(&sent)? })
     }
 
-    /// An encoded map `[1, C, H, W]` as it is kept, before the compressor.
+    /// An encoded feature map `[1, C, H, W]` in its stored form, before the compressor.
     ///
     /// # Errors
-    /// [`DetectorError::Shape`] when the tensor is not a map of this detector.
+    /// [`DetectorError::Shape`] if the tensor is not a feature map of this detector.
     pub fn to_kept(&self, features: &Tensor) -> Result<BevFeatures, DetectorError> {
         let map = one_map(features, self.map_shape())?;
         let channels = self.config.feature_channels() as u32;
@@ -293,7 +296,7 @@ impl Detector {
     }
 }
 
-/// A map `[1, C, H, W]` or `[C, H, W]` of the expected shape as `[1, C, H, W]`.
+/// A feature map `[1, C, H, W]` or `[C, H, W]` of the expected shape as `[1, C, H, W]`.
 fn one_map(features: &Tensor, expected: [i64; 3]) -> Result<Tensor, DetectorError> {
     let found = features.size();
     if found != expected && found.split_first() != Some((&1, expected.as_slice())) {
@@ -342,7 +345,7 @@ mod tests {
     }
 
     #[test]
-    fn it_is_the_trained_network_only_faster() {
+    fn it_computes_the_same_as_the_trained_network() {
         let (_store, pillars) = network();
         let cloud = cloud();
         let mut cropped = Vec::new();
@@ -364,7 +367,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_left_behind_the_compressor_is_what_the_training_saw() {
+    fn the_compressor_gives_the_same_as_in_training() {
         let (_store, pillars) = network_of(&DetectorConfig { compress_ratio: Some(4), ..config() });
         let mut cropped = Vec::new();
         Crop::for_detector(&config()).keep(&cloud().xyzi, &mut cropped);
@@ -378,12 +381,12 @@ mod tests {
         let other = Tensor::zeros([1, 64, 8, 8], (Kind::Float, Device::Cpu));
         assert!(matches!(detector.through_compressor(&other), Err(DetectorError::Shape { .. })));
         let plain = Detector::from_network(network().1);
-        assert!(plain.through_compressor(&encoded).unwrap().equal(&encoded), "there is nothing to lose");
+        assert!(plain.through_compressor(&encoded).unwrap().equal(&encoded), "there is no compressor");
         assert_eq!((plain.sent_shape(), plain.code_of()), (plain.map_shape(), None));
     }
 
     #[test]
-    fn the_code_crosses_the_air_and_its_receiver_widens_it_to_the_same_bits() {
+    fn the_transmitted_code_expands_to_the_same_bits() {
         let (_store, pillars) = network_of(&DetectorConfig { compress_ratio: Some(16), ..config() });
         let mut detector = Detector::from_network(pillars);
         let encoded = detector.encode(&cloud()).unwrap().features;
@@ -420,7 +423,7 @@ mod tests {
     }
 
     #[test]
-    fn a_network_of_a_mirrored_world_sees_the_mirrored_cloud() {
+    fn a_network_of_a_mirrored_frame_gets_the_mirrored_cloud() {
         let (store, pillars) = network();
         let _ = tch::no_grad(|| store.variables()["cls_head.bias"].shallow_clone().fill_(0.5));
         let mut plain = Detector::from_network(pillars);
@@ -445,7 +448,7 @@ mod tests {
     }
 
     #[test]
-    fn it_comes_back_from_its_file_bit_for_bit() {
+    fn loading_from_its_file_is_bit_exact() {
         let (store, pillars) = network();
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("lean.safetensors");
@@ -458,7 +461,7 @@ mod tests {
     }
 
     #[test]
-    fn maps_of_other_detectors_are_refused_with_both_shapes() {
+    fn maps_of_other_detectors_are_rejected_with_both_shapes() {
         let (_store, pillars) = network();
         let detector = Detector::from_network(pillars);
         let other = Tensor::zeros([1, 64, 8, 8], (Kind::Float, Device::Cpu));

@@ -1,4 +1,4 @@
-//! What a detector returns.
+//! Output of a detector.
 
 use protocol::StageTiming;
 use tch::{TchError, Tensor};
@@ -6,36 +6,36 @@ use tch::{TchError, Tensor};
 use super::error::DetectorError;
 use crate::layers::head::HeadOutput;
 
-/// What the encoder makes of one sweep.
+/// Output of the encoder for one sweep.
 #[derive(Debug)]
 pub struct Encoded {
-    /// `[1, C, H, W]` `f32`, contiguous, before the compressor where there is one:
-    /// [`Detector::squeezed`](super::Detector::squeezed) makes of it the transmitted map.
+    /// `[1, C, H, W]` `f32`, contiguous, before the compressor if there is one:
+    /// [`Detector::squeezed`](super::Detector::squeezed) gives the transmitted feature map.
     pub features: Tensor,
-    /// Points inside the area.
+    /// Number of points inside the area.
     pub points: usize,
-    /// Pillars on them.
+    /// Number of pillars.
     pub pillars: usize,
-    /// Time of crop and sorting into pillars, pillar features, and 2D convolutions.
+    /// Durations of crop with sorting into pillars, pillar features, and 2D convolutions.
     pub times: Vec<StageTiming>,
 }
 
-/// What the head makes of a map.
+/// Output of the head for a feature map.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Heads {
     /// `[A, H, W]` logits.
     pub scores: Vec<f32>,
     /// `[7 A, H, W]` offsets.
     pub offsets: Vec<f32>,
-    /// `[H, W]`, 0..1: how sure the head is of a vehicle around each cell.
+    /// `[H, W]`, 0..1: confidence of a vehicle around each cell.
     pub confidence: Vec<f32>,
 }
 
 impl Heads {
-    /// Takes the output for one map to plain values.
+    /// Copies the output for one feature map to plain values.
     ///
     /// # Errors
-    /// The tensor library's.
+    /// Those of the tensor library.
     pub fn new(output: &HeadOutput) -> Result<Self, DetectorError> {
         Ok(Self {
             scores: flat(&output.scores)?,

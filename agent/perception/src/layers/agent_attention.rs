@@ -2,18 +2,18 @@
 
 use tch::{Kind, TchError, Tensor};
 
-/// Fuses the maps of all agents at each cell as the first agent, the ego, attends to them.
+/// Fuses the feature maps of all agents at each cell by the attention of the first agent, the ego.
 ///
-/// At a cell the ego's features are the query, everyone's features are keys and values:
+/// At a cell the ego's features are the query, the features of all agents are keys and values:
 /// `softmax_j(x_0 . x_j / sqrt(C)) x_j`, summed over `j`.
 ///
 /// # Shapes
-/// - `maps`: `[N, C, H, W]` on the ego's lattice, ego first
-/// - `valid`: `[N, H, W]` `bool`, cells that an agent knows something about; the ego's must be all true. `None`: all
+/// - `maps`: `[N, C, H, W]` on the ego's BEV grid, ego first
+/// - `valid`: `[N, H, W]` `bool`, cells that an agent covers; the ego's must be all true. `None`: all
 /// - returns: `[C, H, W]`
 ///
 /// # Errors
-/// The tensor library's, when the shapes do not fit.
+/// Those of the tensor library, when the shapes do not fit.
 pub fn attend_ego(maps: &Tensor, valid: Option<&Tensor>) -> Result<Tensor, TchError> {
     let (_, channels, _, _) = maps.size4()?;
     let query = maps.f_narrow(0, 0, 1)?;
@@ -33,7 +33,7 @@ pub fn attend_ego(maps: &Tensor, valid: Option<&Tensor>) -> Result<Tensor, TchEr
 /// - returns: `[B, C, H, W]`
 ///
 /// # Errors
-/// The tensor library's, when `record_len` does not add up to the number of maps.
+/// Those of the tensor library, when `record_len` does not add up to the number of maps.
 pub fn attend_samples(maps: &Tensor, record_len: &[i64]) -> Result<Tensor, TchError> {
     let samples = maps.f_split_with_sizes(record_len, 0)?;
     let fused: Result<Vec<_>, _> = samples.iter().map(|sample| attend_ego(sample, None)).collect();
@@ -47,7 +47,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn alone_nothing_changes_and_a_masked_agent_does_not_count() {
+    fn ego_only_is_the_identity_and_a_masked_agent_does_not_count() {
         let maps = Tensor::randn([2, 4, 3, 5], (Kind::Float, Device::Cpu));
         let ego = maps.get(0);
         assert!(attend_ego(&maps.narrow(0, 0, 1), None).unwrap().allclose(&ego, 1e-6, 1e-6, false));

@@ -1,4 +1,4 @@
-//! The 2D backbone: blocks that halve the map, each brought back to one lattice and concatenated.
+//! 2D backbone: blocks that halve the feature map, each up-sampled to one BEV grid and concatenated.
 
 use tch::{TchError, Tensor, nn};
 
@@ -14,7 +14,7 @@ pub struct BevBackbone {
     deblocks: Vec<ConvLayer>,
 }
 
-/// The layers of one level.
+/// Layers of one level.
 #[derive(Debug)]
 enum Block {
     Plain(Vec<ConvLayer>),
@@ -52,15 +52,15 @@ impl BevBackbone {
         self.run(x, train, unfused).expect("a backbone without fusion has no shape from outside")
     }
 
-    /// AttFuse's backbone: after every level the agents of a sample are fused on their way to the up-sampling branch,
-    /// while every agent's own features go on down.
+    /// AttFuse's backbone: after every level the agents of a sample are fused before the up-sampling branch, while each
+    /// agent's own features continue to the next level.
     ///
     /// # Shapes
-    /// - `x`: `[sum of record_len, C, H, W]`, all agents on their ego's lattice, ego first in each sample
+    /// - `x`: `[sum of record_len, C, H, W]`, all agents on their ego's BEV grid, ego first in each sample
     /// - returns: `[B, sum of C_up, H', W']`
     ///
     /// # Errors
-    /// The tensor library's, when `record_len` does not add up to the number of maps.
+    /// Those of the tensor library, when `record_len` does not add up to the number of maps.
     pub fn forward_fused(&self, x: &Tensor, record_len: &[i64], train: bool) -> Result<Tensor, TchError> {
         self.run(x, train, |level| attend_samples(level, record_len))
     }
@@ -71,7 +71,7 @@ impl BevBackbone {
         self.blocks.len()
     }
 
-    /// What one level makes of the output of the level above it, or of the canvas.
+    /// Output of one level for the output of the level above it, or for the canvas.
     ///
     /// # Panics
     /// When there is no such level.
@@ -82,7 +82,7 @@ impl BevBackbone {
         }
     }
 
-    /// Brings the outputs of all levels, own or fused, to one lattice: `[N, sum of C_up, H', W']`.
+    /// Up-samples the outputs of all levels, own or fused, to one BEV grid: `[N, sum of C_up, H', W']`.
     pub fn upsampled(&self, levels: &[Tensor], train: bool) -> Tensor {
         let mut levels: Vec<Tensor> =
             self.deblocks.iter().zip(levels).map(|(deblock, level)| deblock.forward(level, train)).collect();

@@ -1,4 +1,4 @@
-//! A 2D convolution with what follows it: batch norm and ReLU.
+//! 2D convolution layer with batch norm and ReLU.
 
 use tch::nn::{self, BatchNormConfig, Init};
 use tch::{TchError, Tensor};
@@ -22,7 +22,7 @@ pub struct Norm {
 }
 
 impl Norm {
-    /// A batch norm that changes nothing until it is trained; epsilon and momentum are those of PointPillars.
+    /// A batch norm that is the identity until it is trained; epsilon and momentum are those of PointPillars.
     #[must_use]
     pub fn new(path: &nn::Path<'_>, channels: i64) -> Self {
         Self::with_eps(path, channels, NORM_EPS, NORM_MOMENTUM)
@@ -50,19 +50,20 @@ impl Norm {
         }
     }
 
-    /// Normalises `[N, C]` or `[N, C, H, W]`; with `train` by the statistics of this batch, which enter the running ones.
+    /// Normalises `[N, C]` or `[N, C, H, W]`; with `train` by the statistics of this batch, which update the running
+    /// ones.
     pub fn forward(&self, x: &Tensor, train: bool) -> Tensor {
         let (weight, bias) = (Some(&self.weight), Some(&self.bias));
         let (mean, var) = (Some(&self.running_mean), Some(&self.running_var));
         x.batch_norm(weight, bias, mean, var, train, self.momentum, self.eps, true)
     }
 
-    /// Shift `[C]` that is learnt.
+    /// Learnt shift `[C]`.
     pub fn bias(&self) -> &Tensor {
         &self.bias
     }
 
-    /// What the norm does with the running statistics: `x * scale + shift`, both `[C]`.
+    /// The norm with its running statistics as `x * scale + shift`, both `[C]`.
     pub fn scale_shift(&self) -> (Tensor, Tensor) {
         let scale = &self.weight / (&self.running_var + self.eps).sqrt();
         let shift = &self.bias - &self.running_mean * &scale;
@@ -70,7 +71,7 @@ impl Norm {
     }
 }
 
-/// Which way a convolution goes.
+/// Direction of a convolution.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Direction {
     /// `[out, in, k, k]` weights.
@@ -79,7 +80,7 @@ enum Direction {
     Up,
 }
 
-/// Convolution, batch norm where there is one, ReLU where asked for.
+/// Convolution with optional batch norm and ReLU.
 #[derive(Debug)]
 pub struct ConvLayer {
     weight: Tensor,
@@ -172,11 +173,11 @@ impl ConvLayer {
 
     /// [`Self::forward`] of one map in inference, the result contiguous as `[1, C_out, H', W']`.
     ///
-    /// A 1x1 layer is one matrix product, whose result can be written in either order at no cost, while turning a
-    /// finished map around takes longer than computing it.
+    /// A 1x1 layer is one matrix product, whose result can be written in either order at no cost, while transposing a
+    /// computed map takes longer than computing it.
     ///
     /// # Errors
-    /// The tensor library's.
+    /// Those of the tensor library.
     pub fn forward_contiguous(&self, x: &Tensor) -> Result<Tensor, TchError> {
         let (batch, input, height, width) = x.size4()?;
         let kernel = self.weight.size();
@@ -191,8 +192,8 @@ impl ConvLayer {
         rows.f_view([1, kernel[0], height, width])
     }
 
-    /// The same layer for inference: the norm's running statistics go into weight and bias, so one pass over the map
-    /// is saved; weights lie channels-last, as the maps do.
+    /// The same layer for inference: the norm's running statistics are folded into weight and bias, which saves one
+    /// pass over the map; weights are channels-last, as the maps are.
     #[must_use]
     pub fn folded(&self) -> Self {
         let output_dim = if self.direction == Direction::Down { 0 } else { 1 };

@@ -1,16 +1,15 @@
-//! The detection head: class logits and box offsets of every anchor.
+//! Detection head: class logits and box offsets of every anchor.
 
 use tch::nn::{self, Init};
 use tch::{Kind, TchError, Tensor};
 
-/// Numbers that describe a box relative to its anchor: x, y, z, h, w, l, yaw.
-pub const BOX_CODE: i64 = 7;
+use crate::model_config::BOX_CODE;
 
-/// Share of positive anchors that a new head assumes, so that the first steps are not spent on unlearning half a map
-/// of vehicles (RetinaNet's prior).
+/// Share of positive anchors that a new head assumes, so that the first steps are not spent on unlearning vehicles in
+/// half of the cells (RetinaNet's prior).
 const PRIOR: f64 = 0.01;
 
-/// What the head says about a map, before any decoding.
+/// Output of the head for a feature map, before any decoding.
 #[derive(Debug)]
 pub struct HeadOutput {
     /// `[B, A, H, W]` logits, one per anchor (the reference's `psm`).
@@ -45,7 +44,7 @@ impl DetectionHead {
     /// `[B, C, H, W]` features to scores and offsets.
     ///
     /// # Errors
-    /// The tensor library's, when the features have another number of channels than the head.
+    /// Those of the tensor library, when the features have another number of channels than the head.
     pub fn forward(&self, features: &Tensor) -> Result<HeadOutput, TchError> {
         let apply = |conv: &nn::Conv2D| features.f_conv2d(&conv.ws, conv.bs.as_ref(), [1, 1], [0, 0], [1, 1], 1);
         Ok(HeadOutput { scores: apply(&self.scores)?, offsets: apply(&self.offsets)? })
@@ -53,7 +52,7 @@ impl DetectionHead {
 }
 
 impl HeadOutput {
-    /// How sure the head is that a vehicle stands around each cell: `[B, H, W]`, 0..1, the best of its anchors.
+    /// Confidence of a vehicle around each cell: `[B, H, W]`, 0..1, the best of its anchors.
     pub fn confidence(&self) -> Tensor {
         self.scores.amax([1], false).sigmoid().to_kind(Kind::Float)
     }

@@ -1,4 +1,4 @@
-//! Residual blocks (He et al., 2016), as CoAlign's backbone is made of.
+//! Residual blocks (He et al., 2016), the elements of CoAlign's backbone.
 
 use tch::{Tensor, nn};
 
@@ -7,7 +7,7 @@ use crate::layers::convolution::ConvLayer;
 /// Epsilon and momentum of the batch norms, PyTorch's own rather than those of PointPillars.
 const NORM: (f64, f64) = (1e-5, 0.1);
 
-/// Two 3x3 convolutions around which the input goes by, strided and projected where its shape has to change.
+/// Two 3x3 convolutions with a skip connection, strided and projected if its shape has to change.
 #[derive(Debug)]
 pub struct ResidualBlock {
     first: ConvLayer,
@@ -16,7 +16,7 @@ pub struct ResidualBlock {
 }
 
 impl ResidualBlock {
-    /// `blocks` of them, the first with `stride`; parameters `<position>.{conv1,bn1,conv2,bn2}.*` and
+    /// Chain of `blocks`, the first with `stride`; parameters `<position>.{conv1,bn1,conv2,bn2}.*` and
     /// `0.downsample.{0,1}.*` under `path`.
     #[must_use]
     pub fn chain(path: &nn::Path<'_>, [input, filters]: [i64; 2], blocks: usize, stride: i64) -> Vec<Self> {

@@ -1,4 +1,4 @@
-//! From the wide backbone map to the one that crosses the air, and a learnt compressor of its channels.
+//! Reduction of the backbone output to the transmitted feature map, and a learnt compressor of its channels.
 
 use tch::{TchError, Tensor, nn};
 
@@ -37,7 +37,7 @@ impl Shrink {
     /// [`Self::forward`] of one map in inference, contiguous.
     ///
     /// # Errors
-    /// The tensor library's.
+    /// Those of the tensor library.
     pub fn forward_contiguous(&self, x: &Tensor) -> Result<Tensor, TchError> {
         match self.layers.split_last() {
             Some((last, rest)) => last.forward_contiguous(&chain(rest, x, false)),
@@ -52,8 +52,8 @@ impl Shrink {
     }
 }
 
-/// Squeezes the channels before the air and widens them again behind it (OpenCOOD's `NaiveCompressor`): the sender has the
-/// first half, every receiver the second.
+/// Compresses the channels before transmission and expands them after it (OpenCOOD's `NaiveCompressor`): the sender has
+/// the first half, every receiver the second.
 #[derive(Debug)]
 pub struct Compressor {
     encoder: ConvLayer,

@@ -1,4 +1,4 @@
-//! Pillars of one or more sweeps as the tensors that the pillar encoder reads.
+//! Batch of pillars: one or more sweeps as the tensors that the pillar encoder takes.
 
 use tch::{Device, Kind, Tensor};
 
@@ -8,14 +8,14 @@ use crate::pillars::voxels::Pillars;
 /// Inputs of the pillar encoder per point: x, y, z, intensity, offset from the pillar's mean, offset from its centre.
 pub const POINT_FEATURES: usize = 10;
 
-/// Where pillars stand: what turns cell indices into metres.
+/// Grid of the pillars: converts cell indices into metres.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PillarLattice {
-    /// Cells along x.
+    /// Number of cells along x.
     pub width: usize,
-    /// Cells along y.
+    /// Number of cells along y.
     pub height: usize,
-    /// Slots of a pillar.
+    /// Number of slots of a pillar.
     pub max_points: usize,
     size_m: [f32; 3],
     /// Centre of cell 0 along x, y, z, metres.
@@ -23,7 +23,7 @@ pub struct PillarLattice {
 }
 
 impl PillarLattice {
-    /// The lattice of a detector.
+    /// The pillar grid of a detector.
     #[must_use]
     pub fn new(config: &DetectorConfig) -> Self {
         let [width, height, _] = config.pillar_grid();
@@ -56,7 +56,7 @@ impl PillarLattice {
 pub struct PillarBatch {
     /// `[P, 10]` `f32`: see [`POINT_FEATURES`].
     pub features: Tensor,
-    /// `[M]` `i64`: points of each pillar.
+    /// `[M]` `i64`: number of points of each pillar.
     pub counts: Tensor,
     /// `[M]` `i64`: index of each pillar's cell in `[B, H, W]`.
     pub cells: Tensor,
@@ -105,7 +105,7 @@ impl PillarBatch {
         }
     }
 
-    /// Where the tensors are.
+    /// Device of the tensors.
     #[must_use]
     pub fn device(&self) -> Device {
         self.features.device()
@@ -117,11 +117,11 @@ impl PillarBatch {
         self.features.size()[0]
     }
 
-    /// Scatters one row per pillar onto the lattice.
+    /// Scatters one row per pillar onto the pillar grid.
     ///
     /// # Shapes
     /// - `rows`: `[M, C]`
-    /// - returns: `[B, C, H, W]`, zero where no pillar stands; channels are innermost in memory, the layout that
+    /// - returns: `[B, C, H, W]`, zero where there is no pillar; channels are innermost in memory, the layout that
     ///   convolutions on a CPU read fastest
     pub fn scatter(&self, rows: &Tensor, lattice: &PillarLattice) -> Tensor {
         let (height, width) = (lattice.height as i64, lattice.width as i64);

@@ -1,4 +1,4 @@
-//! The pillar feature network: ten numbers per point to one feature vector per pillar.
+//! Pillar feature network: from ten values per point to one feature vector per pillar.
 
 use tch::{Tensor, nn};
 
@@ -7,10 +7,10 @@ use crate::pillars::batch::{POINT_FEATURES, PillarBatch};
 
 /// One layer: linear without bias, batch norm, ReLU, maximum over the points of the pillar.
 ///
-/// The reference works on pillars padded with zero rows. Here only real points are computed. In inference the result
-/// is the same: a zero row gives `relu(norm(0))`, which is the floor of every pillar that has a free slot.
+/// The reference computes pillars padded with zero rows. Here only real points are computed. In inference the result
+/// is the same: a zero row gives `relu(norm(0))`, which is the lower bound of every pillar that has a free slot.
 /// In training the batch statistics are taken over the real points and one zero row, not over millions of zero rows;
-/// running statistics therefore differ from those of the reference, while a trained file means the same to both.
+/// running statistics therefore differ from those of the reference, while a trained file is equivalent in both.
 #[derive(Debug)]
 pub struct PillarEncoder {
     linear: Tensor,
@@ -72,7 +72,7 @@ mod tests {
         Voxeliser::for_detector(config).voxelise(&points)
     }
 
-    /// The reference's way: every slot goes through the layer, empty ones as zeros.
+    /// The reference's computation: every slot goes through the layer, empty ones as zeros.
     fn padded(encoder: &PillarEncoder, batch: &PillarBatch, slots: i64) -> Tensor {
         let mut rows = Vec::new();
         let mut first = 0;

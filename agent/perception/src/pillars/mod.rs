@@ -1,4 +1,4 @@
-//! Pillars: from a point cloud to the BEV feature map that a backbone takes.
+//! Pillars: from a point cloud to the canvas of the backbone.
 
 pub mod batch;
 pub mod encoder;

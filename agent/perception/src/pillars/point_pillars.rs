@@ -1,4 +1,4 @@
-//! PointPillars as one network, for training and for inference.
+//! PointPillars network, for training and for inference.
 
 use tch::{Kind, TchError, Tensor, nn};
 
@@ -12,26 +12,26 @@ use crate::pillars::encoder::PillarEncoder;
 /// The detector's network. Parameter names are those of the reference's state dictionary.
 #[derive(Debug)]
 pub struct PointPillars {
-    /// The numbers it was built from.
+    /// Configuration that it was built from.
     pub config: DetectorConfig,
     lattice: PillarLattice,
-    /// Precision of the convolutions in training: `Float`, or `BFloat16` where the processor computes it several times
-    /// as fast. Parameters, norms, pillar features and heads are `f32` in any case.
+    /// Precision of the convolutions in training: `Float`, or `BFloat16` if the CPU computes it several times as fast.
+    /// Parameters, norms, pillar features and heads are `f32` in any case.
     pub compute: Kind,
     /// `pillar_vfe`: points to pillar features.
     pub encoder: PillarEncoder,
     /// `backbone`: the 2D convolutions.
     pub backbone: BevBackbone,
-    /// `shrink_conv`: the last step before the air.
+    /// `shrink_conv`: the last step before transmission.
     pub shrink: Option<Shrink>,
-    /// `naive_compressor`: fewer channels on the air.
+    /// `naive_compressor`: fewer transmitted channels.
     pub compressor: Option<Compressor>,
     /// `cls_head` and `reg_head`.
     pub head: DetectionHead,
 }
 
 impl PointPillars {
-    /// Builds the network under `path` with random parameters (`tch::manual_seed` makes them repeatable).
+    /// Builds the network under `path` with random parameters (`tch::manual_seed` makes them reproducible).
     ///
     /// # Errors
     /// [`ConfigError`] when no network can be built from `config`.
@@ -52,19 +52,19 @@ impl PointPillars {
         })
     }
 
-    /// Where pillars stand on the canvas.
+    /// Grid of the pillars on the canvas.
     #[must_use]
     pub fn lattice(&self) -> &PillarLattice {
         &self.lattice
     }
 
-    /// The map of every sweep that crosses the air: `[B, C, H, W]`, before the compressor.
+    /// Feature map of every sweep: `[B, C, H, W]`, before the compressor.
     pub fn features(&self, batch: &PillarBatch, train: bool) -> Tensor {
         let canvas = batch.scatter(&self.encoder.forward(batch, train), &self.lattice);
         self.features_of_canvas(&canvas, train)
     }
 
-    /// From the canvas `[B, C_pillar, H, W]` on: backbone and shrink, `f32`.
+    /// Feature maps of the canvas `[B, C_pillar, H, W]`: backbone and shrink, `f32`.
     pub fn features_of_canvas(&self, canvas: &Tensor, train: bool) -> Tensor {
         let wide = self.backbone.forward(&canvas.to_kind(self.compute), train);
         let features = match &self.shrink {
@@ -74,7 +74,7 @@ impl PointPillars {
         features.to_kind(Kind::Float)
     }
 
-    /// What the compressor leaves: `[B, C, H, W]` compressed and expanded again; unchanged without a compressor.
+    /// Output of the compressor: `[B, C, H, W]` compressed and expanded again; unchanged without a compressor.
     pub fn through_compressor(&self, features: &Tensor, train: bool) -> Tensor {
         match &self.compressor {
             Some(compressor) => compressor.decode(&compressor.encode(features, train), train),
@@ -85,7 +85,7 @@ impl PointPillars {
     /// Scores and offsets of `[B, C, H, W]` features, of one agent or fused.
     ///
     /// # Errors
-    /// The tensor library's, when the features have another number of channels than the head.
+    /// Those of the tensor library, when the features have another number of channels than the head.
     pub fn heads(&self, features: &Tensor) -> Result<HeadOutput, TchError> {
         self.head.forward(features)
     }
@@ -110,7 +110,7 @@ mod tests {
         PillarBatch::new(&[&pillars, &pillars], &PillarLattice::new(config))
     }
 
-    /// Loss before and after a few steps towards an arbitrary map.
+    /// Loss before and after a few steps towards an arbitrary target.
     fn train(compute: Kind) -> (f64, f64) {
         tch::set_num_threads(1);
         tch::manual_seed(7);
@@ -143,7 +143,7 @@ mod tests {
     }
 
     #[test]
-    fn maps_have_the_promised_shape_and_heads_refuse_others() {
+    fn maps_have_the_documented_shape_and_heads_reject_others() {
         tch::set_num_threads(1);
         let network = VarStore::new(Device::Cpu);
         let config = small();

@@ -1,4 +1,4 @@
-//! The pillar encoder for inference: plain loops over packed points instead of tensors.
+//! Pillar encoder for inference: plain loops over packed points instead of tensors.
 
 use tch::{Kind, Tensor};
 
@@ -6,28 +6,28 @@ use crate::pillars::batch::{POINT_FEATURES, PillarLattice, mean_xyz};
 use crate::pillars::encoder::PillarEncoder;
 use crate::pillars::voxels::Pillars;
 
-/// Channels that are computed together; a few vector registers.
+/// Number of channels that are computed together; a few vector registers.
 const LANES: usize = 16;
 
 /// The folded pillar encoder.
 ///
-/// The ten inputs of a point are linear in its x, y, z, intensity once the pillar is known, and ReLU may wait until
-/// after the maximum. Four multiplications per point and channel remain of the reference's ten. Positions are taken
-/// relative to the pillar's centre, so that nothing is lost 100 m away from the sensor.
+/// The ten inputs of a point are linear in its x, y, z, intensity for a given pillar, and ReLU may be applied after the
+/// maximum. Four multiplications per point and channel remain of the reference's ten. Positions are relative to the
+/// pillar's centre, so that no precision is lost 100 m away from the sensor.
 #[derive(Debug, Clone)]
 pub struct PillarProjection {
     channels: usize,
-    /// `[C / LANES]` of weights of x, y, z (relative to the centre) and intensity, per lane.
+    /// `[C / LANES]`: weights of x, y, z (relative to the centre) and intensity, per lane.
     point: Vec<[[f32; LANES]; 4]>,
-    /// Of the mean's offset from the centre.
+    /// `[C / LANES]`: weights of the mean's offset from the centre.
     mean: Vec<[[f32; LANES]; 3]>,
-    /// Of the centre itself.
+    /// `[C / LANES]`: weights of the centre itself.
     center: Vec<[[f32; LANES]; 3]>,
     bias: Vec<[f32; LANES]>,
 }
 
 impl PillarProjection {
-    /// Takes over the parameters of a trained encoder.
+    /// Projection with the parameters of a trained encoder.
     ///
     /// # Panics
     /// When the parameters are not `f32` on the CPU, which the encoder's constructor rules out.
@@ -71,10 +71,10 @@ impl PillarProjection {
         self.channels
     }
 
-    /// Writes the features of every pillar onto `canvas`, `[H, W, C]` row-major, which the caller has zeroed.
+    /// Writes the features of every pillar to `canvas`, `[H, W, C]` row-major, which the caller has zeroed.
     ///
     /// # Panics
-    /// When the canvas is smaller than the lattice.
+    /// When the canvas is smaller than the pillar grid.
     pub fn scatter(&self, pillars: &Pillars, lattice: &PillarLattice, canvas: &mut [f32]) {
         for (points, coord) in pillars.iter() {
             let cell = lattice.cell(coord) * self.channels;
@@ -126,7 +126,7 @@ mod tests {
     use crate::pillars::voxels::Voxeliser;
 
     #[test]
-    fn it_is_the_encoder_without_tensors() {
+    fn it_computes_the_same_as_the_encoder() {
         tch::set_num_threads(1);
         tch::manual_seed(3);
         let config = DetectorConfig { max_points_per_pillar: 3, pillar_channels: 24, ..DetectorConfig::lean() };

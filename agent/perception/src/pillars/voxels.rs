@@ -1,19 +1,19 @@
-//! Points to pillars: which points stand on which cell of the ground.
+//! Voxelisation: sorts points into pillars on a ground grid.
 //!
-//! The order and the caps are those of the reference library (spconv's CPU generator): pillars are numbered by the
-//! first point that falls on them, the first points of a pillar win, the first pillars of a sweep win.
+//! The order and the limits are those of the reference library (spconv's CPU generator): pillars are numbered by their
+//! first point, the first points of a pillar and the first pillars of a sweep are kept.
 
 use crate::model_config::DetectorConfig;
 
 /// Mark of a cell that has no pillar yet, and of a point that was dropped.
 const NONE: u32 = u32::MAX;
 
-/// Pillars of one sweep: the points of a pillar lie together, in the order of the sweep.
+/// Pillars of one sweep: the points of a pillar are contiguous, in the order of the sweep.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Pillars {
     /// `[P]` of x, y, z (metres) and intensity: pillar after pillar.
     pub points: Vec<[f32; 4]>,
-    /// `[M]`: points of each pillar, at least 1.
+    /// `[M]`: number of points of each pillar, at least 1.
     pub counts: Vec<u32>,
     /// `[M]` of cell indices z, y, x.
     pub coords: Vec<[i32; 3]>,
@@ -26,7 +26,7 @@ impl Pillars {
         self.counts.len()
     }
 
-    /// Whether no point was inside the area.
+    /// True if no point was inside the area.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.counts.is_empty()
@@ -57,12 +57,12 @@ impl Pillars {
     }
 }
 
-/// Sorts sweeps into pillars; keeps its tables between calls.
+/// Sorts sweeps into pillars; reuses its tables between calls.
 #[derive(Debug, Clone)]
 pub struct Voxeliser {
     low: [f32; 3],
     size: [f32; 3],
-    /// Cells along x, y, z.
+    /// Number of cells along x, y, z.
     grid: [usize; 3],
     max_points: u32,
     max_pillars: usize,
@@ -75,7 +75,7 @@ pub struct Voxeliser {
 impl Voxeliser {
     /// A voxeliser for cells of `voxel_size_m` from the lower corner of `lidar_range_m` on.
     ///
-    /// `grid` is the number of cells along x, y, z; the caps are per pillar and per sweep.
+    /// `grid` is the number of cells along x, y, z; the limits are per pillar and per sweep.
     #[must_use]
     pub fn new(
         lidar_range_m: [f64; 6],
@@ -138,7 +138,7 @@ impl Voxeliser {
     /// Indices x, y, z of the cell under a point.
     ///
     /// The division is done in `f32` as in the reference: in `f64` some points on a border change sides. Truncation
-    /// is the floor of a number that is not negative, and the comparison refuses NaN.
+    /// is the floor of a non-negative number, and the comparison excludes NaN.
     fn cell(&self, point: &[f32; 4]) -> Option<[u32; 3]> {
         let mut cell = [0; 3];
         for axis in 0..3 {
@@ -151,7 +151,7 @@ impl Voxeliser {
         Some(cell)
     }
 
-    /// Counts one point on a cell; [`NONE`] when its pillar is full or there are enough pillars.
+    /// Adds one point to a cell; [`NONE`] if its pillar is full or there are enough pillars.
     fn admit(&mut self, [x, y, z]: [u32; 3], pillars: &mut Pillars) -> u32 {
         let cell = (z as usize * self.grid[1] + y as usize) * self.grid[0] + x as usize;
         let mut pillar = self.pillar_of_cell[cell];
@@ -172,7 +172,7 @@ impl Voxeliser {
         pillar
     }
 
-    /// Second pass: brings the points of a pillar together. Returns the number of points placed.
+    /// Second pass: copies the points of a pillar together. Returns the number of points copied.
     fn gather(&self, points: &[[f32; 4]], pillars: &mut Pillars) -> usize {
         let mut next = Vec::with_capacity(pillars.len());
         let mut total = 0;
@@ -225,7 +225,7 @@ mod tests {
     }
 
     #[test]
-    fn points_that_are_no_numbers_are_dropped_and_tables_are_clean_afterwards() {
+    fn points_that_are_not_finite_are_dropped_and_tables_are_clean_afterwards() {
         let mut voxeliser = voxeliser(2, 8);
         let good = [0.5, 0.5, 0.0, 0.0];
         let bad = [[f32::NAN, 0.5, 0.0, 0.0], [0.5, f32::INFINITY, 0.0, 0.0], [0.5, 0.5, f32::NEG_INFINITY, 0.0]];

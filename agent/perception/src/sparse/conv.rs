@@ -1,4 +1,4 @@
-//! One sparse convolution.
+//! Sparse 3-D convolution layer.
 
 use tch::nn::{self, Init};
 use tch::{TchError, Tensor};
@@ -26,15 +26,15 @@ impl SparseConv {
     /// `[N_in, C_in]` to `[N_out, C_out]`, in the precision of `x`.
     ///
     /// # Errors
-    /// The tensor library's, for example when the rows are not those of the rulebook.
+    /// Those of the tensor library, for example when the rows are not those of the rulebook.
     pub fn forward(&self, x: &Tensor, index: &GatherIndex) -> Result<Tensor, TchError> {
         let (rows, channels) = x.size2()?;
         if rows != index.inputs {
             return Err(TchError::Shape(format!("{rows} rows of features, the rulebook is of {}", index.inputs)));
         }
-        // A row of zeros stands for all neighbours that do not exist.
+        // A row of zeros stands for all missing neighbours.
         let padded = Tensor::f_cat(&[x, &x.f_new_zeros([1, channels], (x.kind(), x.device()))?], 0)?;
-        // With an index that is expanded and not written out, gather and its gradient copy whole rows.
+        // With an index that is expanded and not materialised, gather and its gradient copy whole rows.
         let gathered = padded.f_gather(0, &index.rows.f_unsqueeze(1)?.f_expand([-1, channels], false)?, false)?;
         let columns = gathered.f_view([-1, KERNEL_VOLUME as i64 * channels])?;
         self.bias.to_kind(x.kind()).f_addmm(&columns, &self.weight.to_kind(x.kind()))
@@ -121,7 +121,7 @@ mod tests {
     }
 
     #[test]
-    fn rows_of_another_rulebook_are_refused() {
+    fn rows_of_another_rulebook_are_rejected() {
         let network = VarStore::new(Device::Cpu);
         let conv = SparseConv::new(&network.root(), 2, 2);
         let book = Rulebook::submanifold(&Sites::collect([[0, 0, 0]]).0);
@@ -131,7 +131,7 @@ mod tests {
     }
 
     #[test]
-    fn stacked_sweeps_do_not_see_each_other() {
+    fn stacked_sweeps_do_not_influence_each_other() {
         let book = Rulebook::submanifold(&Sites::collect([[0, 0, 0], [0, 0, 1]]).0);
         let network = VarStore::new(Device::Cpu);
         let conv = SparseConv::new(&network.root(), 2, 3);

@@ -1,32 +1,33 @@
-//! Which input row feeds which output row through which weight.
+//! Rulebook of a sparse convolution: input row of each weight and output row.
 
 use tch::{Device, TchError, Tensor};
 
 use super::sites::Sites;
 
-/// Weights of a 3x3x3 kernel.
+/// Number of weights of a 3x3x3 kernel.
 pub const KERNEL_VOLUME: usize = 27;
 /// Mark of a neighbour that does not exist.
 const NONE: u32 = u32::MAX;
 
 /// Neighbours of every output site of a 3x3x3 convolution.
 ///
-/// Offset `k` of `[-1, 1]^3` is `9 (x + 1) + 3 (y + 1) + (z + 1)`: the order of a dense `[3, 3, 3]` kernel over x, y, z.
+/// Offset `k` of `[-1, 1]^3` is `9 (x + 1) + 3 (y + 1) + (z + 1)`: the order of a dense `[3, 3, 3]` kernel over x, y,
+/// z.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Rulebook {
     inputs: usize,
-    /// `[outputs, 27]` of input rows.
+    /// `[outputs, 27]`: input rows.
     rows: Vec<u32>,
 }
 
 impl Rulebook {
-    /// Stride 1: outputs are where inputs are.
+    /// Stride 1: output sites are the input sites.
     #[must_use]
     pub fn submanifold(sites: &Sites) -> Self {
         let mut rows = vec![NONE; sites.len() * KERNEL_VOLUME];
         for (row, &[x, y, z]) in sites.coords().iter().enumerate() {
             rows[row * KERNEL_VOLUME + KERNEL_VOLUME / 2] = row as u32;
-            // What is my neighbour at k has me at 26 - k, so half of the kernel is looked up.
+            // If b is the neighbour of a at offset k, a is that of b at 26 - k, so half of the kernel is looked up.
             for k in KERNEL_VOLUME / 2 + 1..KERNEL_VOLUME {
                 let [dx, dy, dz] = offset(k);
                 if let Some(other) = sites.row([x + dx, y + dy, z + dz]) {
@@ -38,12 +39,12 @@ impl Rulebook {
         Self { inputs: sites.len(), rows }
     }
 
-    /// Stride 2, from the sites of a level to those of the next: output `o` sees inputs `2 o + [-1, 1]^3`.
+    /// Stride 2, from the sites of a level to those of the next: output `o` has the inputs `2 o + [-1, 1]^3`.
     #[must_use]
     pub fn strided(sites: &Sites, halved: &Sites) -> Self {
         let mut rows = vec![NONE; halved.len() * KERNEL_VOLUME];
         for (row, coord) in sites.coords().iter().enumerate() {
-            // An even coordinate is the middle of one output; an odd one lies between two.
+            // An even coordinate is the centre of one output; an odd one lies between two.
             let choices = coord.map(|axis| match axis & 1 {
                 0 => [Some((axis >> 1, 0)), None],
                 _ => [Some((axis >> 1, 1)), Some(((axis >> 1) + 1, -1))],
@@ -73,16 +74,16 @@ impl Rulebook {
         self.rows.len() / KERNEL_VOLUME
     }
 
-    /// Pairs of input and output, of all weights together.
+    /// Number of pairs of input and output, of all weights together.
     #[must_use]
     pub fn pairs(&self) -> usize {
         self.rows.iter().filter(|&&row| row != NONE).count()
     }
 
-    /// The rulebooks of several sweeps as one, their rows one after another, as the tensor library wants it.
+    /// The rulebooks of several sweeps as one, their rows one after another, as a tensor.
     ///
     /// # Errors
-    /// The tensor library's.
+    /// Those of the tensor library.
     pub fn stacked<'a>(books: impl IntoIterator<Item = &'a Self>, device: Device) -> Result<GatherIndex, TchError> {
         let books: Vec<&Self> = books.into_iter().collect();
         let inputs: usize = books.iter().map(|book| book.inputs).sum();
@@ -96,7 +97,7 @@ impl Rulebook {
     }
 }
 
-/// A rulebook on its device.
+/// A rulebook as tensor on its device.
 #[derive(Debug)]
 pub struct GatherIndex {
     /// Number of input rows; also the mark of a missing neighbour.
@@ -123,7 +124,7 @@ mod tests {
     }
 
     #[test]
-    fn two_neighbours_see_each_other() {
+    fn two_neighbours_are_inputs_of_each_other() {
         let book = Rulebook::submanifold(&Sites::collect([[0, 0, 0], [0, 0, 1], [5, 5, 5]]).0);
         assert_eq!((book.inputs(), book.outputs(), book.pairs()), (3, 3, 5));
         assert_eq!(book.rows[index([0, 0, 1])], 1);

@@ -1,4 +1,4 @@
-//! Occupied voxels of one level.
+//! Sites: occupied voxels of one level.
 
 use std::collections::HashMap;
 use std::collections::hash_map::Entry;
@@ -6,7 +6,7 @@ use std::hash::{BuildHasherDefault, Hasher};
 
 /// Bits of a coordinate in a key.
 const AXIS_BITS: u32 = 21;
-/// Coordinates are within this of zero on every axis.
+/// Bound of the absolute value of coordinates on every axis.
 const HALF_RANGE: i32 = 1 << (AXIS_BITS - 1);
 
 /// Occupied voxels in the order of their first appearance, each once.
@@ -17,7 +17,7 @@ pub struct Sites {
 }
 
 impl Sites {
-    /// Sites from coordinates, and the row that each of these came to. Coordinates must be within 2^20 of zero
+    /// Sites from coordinates, and the row of each coordinate. Coordinates must be within 2^20 of zero
     /// ([`Self::holds`]).
     #[must_use]
     pub fn collect(coords: impl IntoIterator<Item = [i32; 3]>) -> (Self, Vec<u32>) {
@@ -26,7 +26,7 @@ impl Sites {
         (sites, rows)
     }
 
-    /// Row of a coordinate, which becomes a site where it is none yet.
+    /// Row of a coordinate, which becomes a site if it is none yet.
     pub fn add(&mut self, coord: [i32; 3]) -> u32 {
         match self.rows.entry(key(coord)) {
             Entry::Occupied(found) => *found.get(),
@@ -37,7 +37,7 @@ impl Sites {
         }
     }
 
-    /// Whether a coordinate is near enough to zero to be a site.
+    /// True if a coordinate is near enough to zero to be a site.
     #[must_use]
     pub fn holds(coord: [i32; 3]) -> bool {
         coord.iter().all(|axis| (-HALF_RANGE..HALF_RANGE).contains(axis))
@@ -49,7 +49,7 @@ impl Sites {
         self.coords.len()
     }
 
-    /// Whether there is none.
+    /// True if there is none.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.coords.is_empty()
@@ -67,7 +67,7 @@ impl Sites {
         self.rows.get(&key(coord)).copied().filter(|_| Self::holds(coord))
     }
 
-    /// The sites of the next level, one for every 2x2x2 voxels with a site in them, and which of them each site lies in.
+    /// The sites of the next level, one for every 2x2x2 voxels with a site in them, and the row in it of each site.
     #[must_use]
     pub fn halved(&self) -> (Self, Vec<u32>) {
         Self::collect(self.coords.iter().map(|coord| coord.map(|axis| axis >> 1)))
@@ -79,7 +79,7 @@ fn key(coord: [i32; 3]) -> u64 {
     coord.iter().fold(0, |key, &axis| key << AXIS_BITS | axis_bits(axis))
 }
 
-/// One multiplication: the keys are places, and the table lives for one sweep.
+/// Hash by one multiplication: the keys are coordinates, and the table is used for one sweep.
 #[derive(Debug, Clone, Copy, Default)]
 struct KeyHasher(u64);
 

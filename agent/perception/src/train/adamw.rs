@@ -1,6 +1,6 @@
-//! Adam with decoupled weight decay, with a state that can be stored and brought back exactly.
+//! AdamW: Adam with decoupled weight decay, with a state that can be saved and restored exactly.
 //!
-//! `tch`'s own optimizer keeps its moments where they cannot be read, so a training could not be resumed with it.
+//! `tch`'s own optimizer does not expose its moments, so a training could not be resumed with it.
 
 use std::collections::BTreeMap;
 
@@ -14,9 +14,9 @@ pub struct AdamWConfig {
     pub beta1: f64,
     /// Decay of the mean squared gradient.
     pub beta2: f64,
-    /// Keeps the division finite.
+    /// Added to the denominator, so that the division is finite.
     pub eps: f64,
-    /// Share of a weight that is taken off per unit of learning rate; vectors (norms, biases) are spared.
+    /// Decoupled weight decay per unit of learning rate; vectors (norms, biases) have none.
     pub weight_decay: f64,
     /// Gradients are scaled down to this norm.
     pub max_gradient_norm: f64,
@@ -28,12 +28,12 @@ impl Default for AdamWConfig {
     }
 }
 
-/// What a step did.
+/// Result of a step.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Step {
-    /// Parameters moved; the norm of the gradient before it was clipped.
-    Pop(f64),
-    /// The gradient was not finite, so nothing moved.
+    /// Parameters were updated; the norm of the gradient before it was clipped.
+    Taken(f64),
+    /// The gradient was not finite, so nothing was updated.
     Skipped,
 }
 
@@ -55,7 +55,7 @@ struct Entry {
 }
 
 impl AdamW {
-    /// An optimizer that has not moved yet.
+    /// Optimizer before its first step.
     #[must_use]
     pub fn new(variables: &VarStore, config: AdamWConfig) -> Self {
         let named: BTreeMap<String, Tensor> = variables.variables().into_iter().collect();
@@ -70,12 +70,12 @@ impl AdamW {
         Self { config, entries: entries.collect(), steps: 0 }
     }
 
-    /// Forgets the gradients of the last step.
+    /// Clears the gradients of the last step.
     pub fn zero_grad(&mut self) {
         self.entries.iter_mut().for_each(|entry| entry.variable.zero_grad());
     }
 
-    /// Moves every variable by its gradient.
+    /// Updates every variable by its gradient.
     ///
     /// # Errors
     /// [`TchError`] from the tensor library.
@@ -106,11 +106,12 @@ impl AdamW {
                 let change = (&entry.mean * (learning_rate / mean_correction)).f_div_(&deviation)?;
                 let _ = entry.variable.f_sub_(&change)?;
             }
-            Ok(Step::Pop(norm))
+            Ok(Step::Taken(norm))
         })
     }
 
-    /// The moments by name (the next step changes them), `mean.<variable>` and `square.<variable>`, and the number of steps taken.
+    /// The moments by name (the next step changes them), `mean.<variable>` and `square.<variable>`, and the number of
+    /// steps.
     #[must_use]
     pub fn state(&self) -> (BTreeMap<String, Tensor>, i64) {
         let both = self.entries.iter().flat_map(|entry| {
@@ -120,7 +121,7 @@ impl AdamW {
         (both.collect(), self.steps)
     }
 
-    /// Takes over a state of [`Self::state`].
+    /// Restores a state of [`Self::state`].
     ///
     /// # Errors
     /// The name of a moment that is missing or of another shape.
@@ -137,7 +138,7 @@ impl AdamW {
     }
 }
 
-/// Norm of all gradients together; variables that had no part in the loss count as zero.
+/// Norm of all gradients together; variables that are not part of the loss count as zero.
 fn global_norm(gradients: &[Tensor]) -> Result<f64, TchError> {
     let squares: Result<Vec<Tensor>, TchError> = (gradients.iter().filter(|gradient| gradient.defined()))
         .map(|gradient| gradient.f_square()?.f_sum(Kind::Double))
@@ -166,12 +167,12 @@ mod tests {
         for _ in 0..steps {
             optimizer.zero_grad();
             (point - Tensor::from_slice(&[1f32, -1.0])).square().sum(Kind::Float).backward();
-            assert!(matches!(optimizer.step(0.1).unwrap(), Step::Pop(_)));
+            assert!(matches!(optimizer.step(0.1).unwrap(), Step::Taken(_)));
         }
     }
 
     #[test]
-    fn finds_the_bottom_of_a_bowl() {
+    fn finds_the_minimum_of_a_quadratic() {
         let (variables, point) = quadratic();
         let mut optimizer = AdamW::new(&variables, AdamWConfig::default());
         descend(&mut optimizer, &point, 300);
@@ -180,7 +181,7 @@ mod tests {
     }
 
     #[test]
-    fn a_restored_state_goes_on_bit_for_bit() {
+    fn a_restored_state_continues_bit_for_bit() {
         let (variables, point) = quadratic();
         let mut optimizer = AdamW::new(&variables, AdamWConfig::default());
         descend(&mut optimizer, &point, 5);
@@ -197,7 +198,7 @@ mod tests {
     }
 
     #[test]
-    fn a_gradient_that_is_no_number_moves_nothing() {
+    fn a_gradient_that_is_not_finite_updates_nothing() {
         let (variables, point) = quadratic();
         let mut optimizer = AdamW::new(&variables, AdamWConfig::default());
         (&point * f64::NAN).sum(Kind::Float).backward();

@@ -1,4 +1,4 @@
-//! A progress bar where somebody watches, else a line now and then.
+//! Progress of a training: a bar on a terminal, else a line now and then.
 
 use std::cell::Cell;
 use std::time::{Duration, Instant};
@@ -9,33 +9,33 @@ use support::progress;
 
 use super::run_config::Length;
 
-/// Plain lines come no more often than this.
+/// Shortest time between two plain lines.
 const LINE_EVERY: Duration = Duration::from_secs(10);
-/// So long sweeps are encoded before it is foretold how long all of them take.
-const FORETOLD_AFTER: Duration = Duration::from_secs(3);
+/// Time of encoding after which its total duration is estimated.
+const ESTIMATE_AFTER: Duration = Duration::from_secs(3);
 /// Parts of the bar, of 1000 steps each.
 const PARTS: usize = 10;
 
-/// Shows on standard error how a training goes.
+/// Shows the progress of a training on standard error.
 #[derive(Debug)]
 pub struct TrainingBar {
     bar: ProgressBar,
     is_watched: bool,
     last_line: Cell<Option<Instant>>,
     encoding: Cell<Option<Encoding>>,
-    /// What follows the encoding.
+    /// Length of the training that follows the encoding.
     length: Option<Length>,
 }
 
-/// How the sweeps of one data set are being encoded.
+/// Progress of the encoding of one data set.
 #[derive(Debug, Clone, Copy)]
 struct Encoding {
     began: Instant,
-    /// So many were encoded when it began: maps that an earlier run has kept are there at once.
+    /// Number of sweeps encoded at its start: feature maps that an earlier run has stored count at once.
     first: usize,
     latest: usize,
-    /// Whether it has been said how long it will take.
-    is_foretold: bool,
+    /// True if the estimate has been printed.
+    is_estimated: bool,
 }
 
 impl Default for TrainingBar {
@@ -46,28 +46,29 @@ impl Default for TrainingBar {
 }
 
 impl TrainingBar {
-    /// A bar for a training of this length, which it foretells where sweeps have to be encoded first.
+    /// Bar for a training of this length, which is part of the estimate if sweeps have to be encoded first.
     #[must_use]
     pub fn of(length: Length) -> Self {
         Self { length: Some(length), ..Self::default() }
     }
 
-    /// Says how far it is: `share_done` 0..1 after `seconds`, and how it goes.
+    /// Shows the progress: `share_done` 0..1 after `seconds`, and a text.
     pub fn report(&self, share_done: f64, seconds: f64, text: &str) {
         self.show(share_done, remaining_s(share_done, 1.0 - share_done, seconds), text);
     }
 
-    /// Says that `done` of `all` sweeps of a data set are encoded; fewer than before are of the next one.
+    /// Shows that `done` of `all` sweeps of a data set are encoded; a smaller number than before belongs to the next
+    /// one.
     pub fn encoded(&self, done: usize, all: usize) {
-        let fresh = Encoding { began: Instant::now(), first: done, latest: done, is_foretold: false };
+        let fresh = Encoding { began: Instant::now(), first: done, latest: done, is_estimated: false };
         let mut encoding = self.encoding.get().filter(|known| known.latest <= done).unwrap_or(fresh);
         encoding.latest = done;
         let left = all.saturating_sub(done) as f64;
         let passed = encoding.began.elapsed();
         let remaining_s = remaining_s((done - encoding.first) as f64, left, passed.as_secs_f64());
-        if let Some(remaining_s) = remaining_s.filter(|_| !encoding.is_foretold && passed >= FORETOLD_AFTER) {
-            self.say(&foretold(all, passed.as_secs_f64() + remaining_s, self.length));
-            encoding.is_foretold = true;
+        if let Some(remaining_s) = remaining_s.filter(|_| !encoding.is_estimated && passed >= ESTIMATE_AFTER) {
+            self.say(&estimate(all, passed.as_secs_f64() + remaining_s, self.length));
+            encoding.is_estimated = true;
         }
         self.encoding.set(Some(encoding));
         self.show(done as f64 / all.max(1) as f64, remaining_s, &format!("{done} of {all} sweeps encoded"));
@@ -78,25 +79,25 @@ impl TrainingBar {
             self.bar.set_position((share_done * 1000.0 * PARTS as f64) as u64);
             self.bar.set_message(text.to_owned());
         } else if self.last_line.get().is_none_or(|last| last.elapsed() >= LINE_EVERY) {
-            let to_go = remaining_s.map(|seconds| format!(", {seconds:.0} s to go")).unwrap_or_default();
+            let to_go = remaining_s.map(|seconds| format!(", {seconds:.0} s remaining")).unwrap_or_default();
             output::note(format_args!("{text}, {:.1} % done{to_go}", 100.0 * share_done));
             self.last_line.set(Some(Instant::now()));
         }
     }
 
-    /// A line that stays.
+    /// Prints a line that stays.
     pub fn say(&self, text: &str) {
         if self.is_watched { self.bar.println(text) } else { output::note(text) }
     }
 
-    /// Takes the bar away.
+    /// Removes the bar.
     pub fn finish(&self) {
         self.bar.finish_and_clear();
     }
 }
 
-/// What is to come: the encoding of all sweeps, and then the training.
-fn foretold(sweeps: usize, seconds: f64, length: Option<Length>) -> String {
+/// Estimate of the duration of the encoding of all sweeps, and the training after it.
+fn estimate(sweeps: usize, seconds: f64, length: Option<Length>) -> String {
     let then = match length {
         Some(Length::Time(time)) => format!(", then {} of training", minutes(time.as_secs_f64())),
         Some(Length::Steps(steps)) => format!(", then {steps} steps of training"),
@@ -106,12 +107,12 @@ fn foretold(sweeps: usize, seconds: f64, length: Option<Length>) -> String {
     format!("encoding {sweeps} sweeps takes {}{then}", minutes(seconds))
 }
 
-/// A time as people give it.
+/// A duration in readable units.
 fn minutes(seconds: f64) -> String {
     if seconds < 90.0 { format!("{seconds:.0} s") } else { format!("{:.0} min", seconds / 60.0) }
 }
 
-/// How long what is `left` will take when `done` took `seconds`; not known before anything is done.
+/// Estimated time for `left` when `done` took `seconds`; `None` before anything is done.
 fn remaining_s(done: f64, left: f64, seconds: f64) -> Option<f64> {
     (done > 0.0).then(|| seconds * left / done)
 }
@@ -121,19 +122,19 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_left_takes_as_long_as_what_was_done() {
+    fn the_remaining_time_is_proportional() {
         assert_eq!(remaining_s(0.25, 0.75, 20.0), Some(60.0));
         assert_eq!(remaining_s(1.0, 0.0, 20.0), Some(0.0));
         assert_eq!(remaining_s(0.0, 1.0, 20.0), None);
     }
 
     #[test]
-    fn the_encoding_and_what_follows_it_are_foretold() {
-        let training = |length| foretold(600, 540.0, length);
+    fn the_durations_of_encoding_and_training_are_estimated() {
+        let training = |length| estimate(600, 540.0, length);
         let time = Some(Length::Time(Duration::from_secs(1200)));
         assert_eq!(training(time), "encoding 600 sweeps takes 9 min, then 20 min of training");
         assert_eq!(training(Some(Length::Steps(50))), "encoding 600 sweeps takes 9 min, then 50 steps of training");
-        assert_eq!(foretold(20, 42.4, None), "encoding 20 sweeps takes 42 s");
+        assert_eq!(estimate(20, 42.4, None), "encoding 20 sweeps takes 42 s");
     }
 
     #[test]
@@ -143,7 +144,7 @@ mod tests {
             bar.encoded(done, 200);
             bar.encoding.get().map(|encoding| encoding.first)
         };
-        // Sixty maps were kept by an earlier run; then the next data set.
+        // An earlier run stored sixty feature maps; then the next data set.
         assert_eq!([first(60), first(150), first(200), first(50), first(100)], [60, 60, 60, 50, 50].map(Some));
     }
 }

@@ -1,4 +1,4 @@
-//! What stands beside weights: what was trained on what, and how good it is.
+//! Model card: training, data and accuracy of a weights file.
 
 use std::fmt::{Display, Write};
 use std::path::Path;
@@ -9,26 +9,26 @@ use super::error::TrainingError;
 use super::run_config::RunConfig;
 use super::trainer::Trained;
 
-/// A model card in Markdown: a title, a sentence, a table, and what else there is to say.
+/// A model card in Markdown: a title, a sentence, a table, and further paragraphs.
 #[derive(Debug)]
 pub struct ModelCard {
     text: String,
 }
 
 impl ModelCard {
-    /// A card whose table is still empty.
+    /// A card with an empty table.
     #[must_use]
     pub fn new(title: &str, about: &str) -> Self {
         Self { text: format!("# {title}\n\n{about}\n\n| | |\n| --- | --- |\n") }
     }
 
-    /// A row of the table.
+    /// Appends a row to the table.
     pub fn row(&mut self, name: &str, value: impl Display) {
         // Writing into a string cannot fail.
         let _ = writeln!(self.text, "| {name} | {value} |");
     }
 
-    /// The rows that every card has; `data` says what was learnt from, `unit` what a batch consists of.
+    /// The rows that every card has; `data` describes the training data, `unit` the elements of a batch.
     pub fn trained(&mut self, run: &RunConfig, trained: &Trained, data: &str, unit: &str) {
         self.row("command", format_args!("`{}`", run.command));
         self.row("parameters", trained.parameters);
@@ -43,17 +43,17 @@ impl ModelCard {
         self.row("time", format_args!("{:.0} s", trained.seconds));
     }
 
-    /// A paragraph or a table below.
+    /// Appends a paragraph or a table.
     pub fn paragraph(&mut self, text: &str) {
         let _ = writeln!(self.text, "\n{text}");
     }
 
-    /// The configuration of the network.
+    /// Appends the configuration of the network.
     pub fn configuration(&mut self, config: &impl Serialize) {
         self.configuration_json(&serde_json::to_string_pretty(config).unwrap_or_default());
     }
 
-    /// The same as JSON text.
+    /// Appends the configuration, given as JSON text.
     pub fn configuration_json(&mut self, json: &str) {
         self.paragraph(&format!("Configuration:\n\n```json\n{json}\n```"));
     }

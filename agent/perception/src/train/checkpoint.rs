@@ -1,7 +1,8 @@
-//! The state of a training on disk: parameters, moments and counters in one file that appears only when it is whole.
+//! Checkpoint of a training on disk: parameters, moments and counters in one file that is replaced atomically.
 //!
-//! Order and augmentation of samples follow from seed and step, so no state of a random number generator has to be kept.
-//! The one exception are the heads of towns: one that is resumed begins a new pass over its cells, with all of its sweeps.
+//! Order and augmentation of samples follow from seed and step, so no state of a random number generator has to be
+//! stored. The one exception are scene-specific heads: one that is resumed begins a new pass over its cells, with all
+//! of its sweeps.
 
 use std::collections::{BTreeMap, HashMap};
 use std::fs;
@@ -17,47 +18,47 @@ use tch::{Kind, TchError, Tensor, no_grad};
 
 use super::adamw::AdamW;
 
-/// Metadata key of what the training itself remembers.
+/// Metadata key of the progress of the training.
 const PROGRESS_KEY: &str = "progress";
 
-/// Why a checkpoint cannot be written or continued.
+/// Error of writing or restoring a checkpoint.
 #[derive(Debug, thiserror::Error)]
 pub enum CheckpointError {
-    /// The system refused.
+    /// The system failed to read or write the file.
     #[error("{}: {source}", path.display())]
     Io {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// What the system said.
+        /// Error of the operating system.
         source: io::Error,
     },
-    /// Cut off, or no safetensors file.
-    #[error("{}: not a whole checkpoint: {source}", path.display())]
+    /// The file is truncated, or no safetensors file.
+    #[error("{}: not a complete checkpoint: {source}", path.display())]
     Format {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// What is wrong.
+        /// Error of the format.
         source: SafeTensorError,
     },
-    /// Another network, or no checkpoint at all.
+    /// The checkpoint is of another network, or the file is no checkpoint.
     #[error("{}: {reason}", path.display())]
     Mismatch {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// What does not fit.
+        /// Entry that does not fit.
         reason: String,
     },
-    /// The tensor library refused.
+    /// The tensor library failed.
     #[error("{}: {source}", path.display())]
     Torch {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// What it said.
+        /// Error of the tensor library.
         source: TchError,
     },
 }
 
-/// Writes the whole state of a training; `progress` is what it remembers beside parameters and moments.
+/// Writes the whole state of a training; `progress` is its state beside parameters and moments.
 ///
 /// # Errors
 /// [`CheckpointError`] when the file cannot be written.
@@ -89,10 +90,11 @@ pub fn save<P: Serialize>(
     atomic_file::write(path, bytes).map_err(io)
 }
 
-/// Brings a training back to where [`save`] left it.
+/// Restores a training from a file of [`save`].
 ///
 /// # Errors
-/// [`CheckpointError`] when the file is missing, cut off or of another network; nothing has been changed in that case.
+/// [`CheckpointError`] when the file is missing, truncated or of another network; nothing has been changed in that
+/// case.
 pub fn restore<P: DeserializeOwned>(
     path: &Path,
     variables: &VarStore,
@@ -172,7 +174,7 @@ mod tests {
     }
 
     #[test]
-    fn files_of_another_network_and_cut_files_are_refused() {
+    fn files_of_another_network_and_truncated_files_are_rejected() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("checkpoint.safetensors");
         let (variables, optimizer) = network(3);

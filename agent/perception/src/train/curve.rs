@@ -1,4 +1,4 @@
-//! The course of a training as CSV.
+//! Training curve as CSV.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::Write;
@@ -8,7 +8,7 @@ use support::atomic_file;
 
 use super::error::TrainingError;
 
-/// Appends rows, the first cell of which is the step; every row is on disk when the call returns.
+/// Appends rows that begin with the step; every row is on disk when the call returns.
 #[derive(Debug)]
 pub struct Curve {
     path: PathBuf,
@@ -16,8 +16,8 @@ pub struct Curve {
 }
 
 impl Curve {
-    /// Begins a file, or goes on with what it holds up to the step of a checkpoint: later rows are of steps that are about
-    /// to be done again.
+    /// Creates a file, or continues the one there is from the step of a checkpoint: later rows are of steps that will
+    /// be repeated.
     ///
     /// # Errors
     /// [`TrainingError::Io`] when the file cannot be read or written.
@@ -32,13 +32,13 @@ impl Curve {
         Ok(Self { path: path.to_owned(), file })
     }
 
-    /// Where it lies.
+    /// Path of the file.
     #[must_use]
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Appends a row of cells that are written already.
+    /// Appends a row of formatted cells.
     ///
     /// # Errors
     /// [`TrainingError::Io`] when the file cannot be written.
@@ -56,7 +56,7 @@ impl Curve {
     }
 }
 
-/// The header and all rows up to `step`; a row that the end of a process has cut off is none.
+/// The header and all rows up to `step`; a truncated last row is left out.
 fn rows_until(csv: &str, step: u64) -> String {
     let is_kept = |row: &str| {
         let first = row.split(',').next().and_then(|cell| cell.parse::<f64>().ok());
@@ -71,7 +71,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_training_that_goes_on_writes_no_step_twice() {
+    fn a_resumed_training_writes_no_step_twice() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("curve.csv");
         let mut first = Curve::open(&path, "step,loss", None).unwrap();

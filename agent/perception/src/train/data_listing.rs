@@ -1,19 +1,19 @@
-//! Which data a training learns from.
+//! Identity of the data of a training.
 
-/// Which data a training learns from, and what of it cannot be used.
+/// Identity of the data of a training, and the part of it that cannot be used.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct DataListing {
-    /// SHA-256 over names, agents, capture times and cheap digests of what the files hold: see
-    /// [`content_sha256`](dataset::content_sha256).
+    /// SHA-256 over names, agents, capture times and cheap digests of the files' contents: see
+    /// `dataset::content_sha256`.
     pub sha256: String,
-    /// Sweeps whose pose is not known.
+    /// Number of sweeps without a known pose.
     pub without_pose: usize,
-    /// What is wrong with the folders: missing files, what is not understood.
+    /// Problems of the folders: missing files, unsupported content.
     pub problems: Vec<String>,
 }
 
 impl DataListing {
-    /// Says what is left out; nothing where all can be used.
+    /// Text of the data that are left out; `None` if all can be used.
     #[must_use]
     pub fn left_out(&self) -> Option<String> {
         let sweeps = (self.without_pose > 0).then(|| format!("{} sweeps without a pose left out", self.without_pose));
@@ -29,7 +29,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_left_out_is_said_with_its_count() {
+    fn data_that_are_left_out_are_counted() {
         let whole = DataListing { sha256: "12ab".into(), ..DataListing::default() };
         assert_eq!(whole.left_out(), None);
         let problems = vec!["a.pcd: cut off".into(), "b.yaml: empty".into()];

@@ -1,4 +1,4 @@
-//! Why a training ends early, whatever it trains.
+//! Errors that end any training early.
 
 use std::io;
 use std::path::PathBuf;
@@ -9,26 +9,26 @@ use super::checkpoint::CheckpointError;
 use crate::torch_error::first_line;
 use crate::weights::WeightsError;
 
-/// Why a training ended early.
+/// Error that ends a training early.
 #[derive(Debug, thiserror::Error)]
 pub enum TrainingError {
-    /// The checkpoint cannot be written or continued.
+    /// The checkpoint cannot be written or restored.
     #[error(transparent)]
     Checkpoint(#[from] CheckpointError),
     /// The checkpoint is of another training.
     #[error("the checkpoint was made with {field} {found}, not {asked}")]
     OtherTraining {
-        /// What differs.
+        /// Name of the field that differs.
         field: &'static str,
-        /// In the checkpoint.
+        /// Value in the checkpoint.
         found: String,
-        /// On the command line.
+        /// Value on the command line.
         asked: String,
     },
-    /// The loss has left the numbers.
+    /// The loss has diverged.
     #[error("the gradient was not finite {0} times in a row; try a lower learning rate")]
     Diverged(u32),
-    /// A thread that prepares batches has died.
+    /// A thread that prepares batches has ended.
     #[error("a thread that prepares batches has ended early")]
     LoaderGone,
     /// Weights cannot be written.
@@ -37,12 +37,12 @@ pub enum TrainingError {
     /// A file cannot be read or written.
     #[error("{}: {source}", path.display())]
     Io {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// What the system said.
+        /// Error of the operating system.
         source: io::Error,
     },
-    /// The tensor library refused.
+    /// The tensor library failed.
     #[error("training: {}", first_line(.0))]
     Tensor(#[from] TchError),
 }

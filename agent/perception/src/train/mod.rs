@@ -1,5 +1,4 @@
-//! What every training here has in common: how it is told what to do, steps and checkpoints, batches ahead, and what it
-//! leaves behind.
+//! Common parts of all trainings: options, steps and checkpoints, prefetched batches, results.
 
 pub mod checkpoint;
 

@@ -1,4 +1,4 @@
-//! The part of the command line that all trainings share.
+//! Command-line options that all trainings share.
 
 use std::io;
 use std::path::PathBuf;
@@ -11,24 +11,24 @@ use tch::{Cuda, Device};
 use super::run_config::{ComputePrecision, Length, RunConfig};
 use super::trainer::Trained;
 
-/// Options that no training can run with.
+/// Options that are invalid for any training.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum OptionsError {
-    /// No length, or none at all.
+    /// No length, or zero.
     #[error("one of --steps, --epochs and --minutes is needed, above zero")]
     Length,
-    /// Steps without samples.
-    #[error("--batch is above zero")]
+    /// Batches without samples.
+    #[error("--batch must be above zero")]
     Batch,
-    /// A training lies in the folder of the results already.
-    #[error("{}: a training lies there already; --resume goes on with it, --force begins anew over it", .0.display())]
+    /// The folder of the results already holds a training.
+    #[error("{}: it already holds a training; --resume continues it, --force overwrites it", .0.display())]
     Trained(PathBuf),
-    /// There is no such device.
+    /// There is no CUDA device.
     #[error("no CUDA device, or a libtorch without CUDA")]
     NoCuda,
 }
 
-/// How long, where, and in which numbers.
+/// Options of length, device, precision and results.
 #[derive(Debug, clap::Args)]
 pub struct TrainingOptions {
     /// Length in steps.
@@ -37,13 +37,13 @@ pub struct TrainingOptions {
     /// Length in passes over the data.
     #[arg(long, group = "length")]
     epochs: Option<f64>,
-    /// Length in minutes; the learning rate follows the clock, so the result is not repeatable to the bit.
+    /// Length in minutes; the learning rate follows the clock, so the result is not bit-reproducible.
     #[arg(long, group = "length")]
     minutes: Option<f64>,
     /// Seed of parameters, order and augmentation.
     #[arg(long, default_value_t = 0)]
     seed: u64,
-    /// Where to compute.
+    /// Device to compute on.
     #[arg(long, value_enum, default_value_t = DeviceName::Cpu)]
     device: DeviceName,
     /// Threads of the network on the CPU.
@@ -52,16 +52,16 @@ pub struct TrainingOptions {
     /// Threads that prepare batches.
     #[arg(long, default_value_t = 1)]
     loader_threads: usize,
-    /// Numbers that products are computed in; on a processor without bfloat16 of its own, bf16 is f32.
+    /// Number format of products; on a CPU without native bfloat16, bf16 is f32.
     #[arg(long, value_enum, default_value_t = ComputePrecision::F32)]
     precision: ComputePrecision,
     /// Folder of the results.
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
-    /// Go on from the checkpoint in --out.
+    /// Resume from the checkpoint in --out.
     #[arg(long)]
     resume: bool,
-    /// Begin anew where a training lies in --out already; its files are overwritten.
+    /// Restart if --out already holds a training; its files are overwritten.
     #[arg(long, conflicts_with = "resume")]
     force: bool,
     /// Print the summary as JSON.
@@ -71,18 +71,18 @@ pub struct TrainingOptions {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum DeviceName {
-    /// The processor.
+    /// The CPU.
     Cpu,
     /// The first CUDA device.
     Cuda,
 }
 
 impl TrainingOptions {
-    /// What a training is told; sets the tensor library's number of threads on the way. A line on standard error where the
-    /// processor cannot do what was asked for.
+    /// The configuration of a training; also sets the tensor library's number of threads. Prints a line to standard
+    /// error if the CPU does not support the requested precision.
     ///
     /// # Errors
-    /// [`OptionsError`] says which option is at fault.
+    /// [`OptionsError`] names the option that is invalid.
     pub fn run_config(&self, batch: usize, learning_rate: f64) -> Result<RunConfig, OptionsError> {
         if batch == 0 {
             return Err(OptionsError::Batch);
@@ -103,7 +103,7 @@ impl TrainingOptions {
         })
     }
 
-    /// Prints how a training ended; `more` is an object of what JSON has beside steps, time and weights.
+    /// Prints the result of a training; `more` is an object of further JSON fields beside steps, time and weights.
     ///
     /// # Errors
     /// As [`output::line`].
@@ -121,7 +121,7 @@ impl TrainingOptions {
         }
     }
 
-    /// Refuses to overwrite a training, unless told to.
+    /// Rejects an existing training, unless overwriting is requested.
     fn check_out(&self) -> Result<(), OptionsError> {
         let files = ["weights.safetensors", "checkpoint.safetensors"].map(|name| self.out.join(name));
         match files.into_iter().find(|file| file.exists()) {
@@ -130,13 +130,10 @@ impl TrainingOptions {
         }
     }
 
-    /// The numbers to compute in on a device, where the processor may have no bfloat16 of its own: it would take many times
-    /// longer then.
+    /// The number format of a device: bfloat16 without support in the CPU would take many times longer.
     fn precision_on(&self, device: Device, has_bfloat16: bool) -> ComputePrecision {
         if self.precision == ComputePrecision::Bf16 && device == Device::Cpu && !has_bfloat16 {
-            output::note(
-                "--precision bf16: this processor has no bfloat16 of its own, so f32 is used, which is faster here",
-            );
+            output::note("--precision bf16: this CPU has no native bfloat16, so f32 is used, which is faster here");
             return ComputePrecision::F32;
         }
         self.precision
@@ -162,7 +159,7 @@ impl TrainingOptions {
     }
 }
 
-/// Whether the processor multiplies in bfloat16 itself.
+/// True if the CPU multiplies in bfloat16 natively.
 fn has_bfloat16() -> bool {
     #[cfg(target_arch = "x86_64")]
     return std::arch::is_x86_feature_detected!("avx512bf16");
@@ -172,10 +169,10 @@ fn has_bfloat16() -> bool {
     false
 }
 
-/// The first CUDA device; without this question the tensor library panics where there is none.
+/// The first CUDA device; without this check the tensor library panics if there is none.
 ///
 /// # Errors
-/// [`OptionsError::NoCuda`] when there is none, or the tensor library is one without CUDA.
+/// [`OptionsError::NoCuda`] when there is none, or the tensor library was built without CUDA.
 pub fn cuda_device() -> Result<Device, OptionsError> {
     if Cuda::is_available() { Ok(Device::Cuda(0)) } else { Err(OptionsError::NoCuda) }
 }
@@ -211,7 +208,7 @@ mod tests {
     }
 
     #[test]
-    fn a_training_is_overwritten_only_where_that_is_asked_for() {
+    fn a_training_is_overwritten_only_on_request() {
         let folder = tempfile::tempdir().unwrap();
         let line = |rest: &str| run_config(&format!("train --steps 3 --out {} {rest}", folder.path().display()), 4);
         assert!(line("").is_ok());

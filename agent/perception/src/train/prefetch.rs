@@ -1,17 +1,17 @@
-//! Threads that prepare batches ahead of a training.
+//! Prefetching: threads that prepare batches ahead of a training.
 
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread;
 
 use super::error::TrainingError;
 
-/// Batches that one thread may be ahead.
+/// Number of batches that one thread may be ahead.
 const AHEAD: usize = 3;
 
 /// An endless sequence of batches, each a function of its number alone, so the same for any number of threads.
 ///
 /// Thread k of T prepares batches k, k + T, k + 2T and so on into a queue of its own, and the queues are read in turn:
-/// that keeps the order without a word between threads. They end when this is dropped.
+/// that keeps the order without synchronisation between threads. They end when this is dropped.
 #[derive(Debug)]
 pub struct Prefetch<T> {
     queues: Vec<Receiver<T>>,
@@ -35,7 +35,7 @@ impl<T: Send + 'static> Prefetch<T> {
     /// The next batch.
     ///
     /// # Errors
-    /// [`TrainingError::LoaderGone`] when the thread that should have prepared it has died.
+    /// [`TrainingError::LoaderGone`] when the thread that should have prepared it has ended.
     pub fn next_batch(&mut self) -> Result<T, TrainingError> {
         let queue = self.next;
         self.next = (queue + 1) % self.queues.len();
@@ -45,7 +45,7 @@ impl<T: Send + 'static> Prefetch<T> {
 
 fn work<T>(mut prepare: impl FnMut(u64) -> T, first: u64, step: usize, queue: &SyncSender<T>) {
     for number in (first..).step_by(step) {
-        // The receiver is gone when the training has ended.
+        // The receiver is dropped when the training has ended.
         if queue.send(prepare(number)).is_err() {
             return;
         }

@@ -1,4 +1,4 @@
-//! What every training is told: how long, how fast, where, and in which numbers.
+//! Configuration of any training run: length, learning rate, device and precision.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -8,35 +8,35 @@ use tch::{Device, Kind};
 use super::adamw::AdamWConfig;
 use super::error::TrainingError;
 
-/// How a training runs, whatever it trains.
+/// Configuration of a training run, for any network.
 #[derive(Debug, Clone)]
 pub struct RunConfig {
-    /// How long.
+    /// Length of the training.
     pub length: Length,
-    /// Samples, pairs, sweeps or cells of a step.
+    /// Number of samples, pairs, sweeps or cells per step.
     pub batch: usize,
     /// Highest learning rate.
     pub learning_rate: f64,
-    /// The optimizer.
+    /// Constants of the optimizer.
     pub optimizer: AdamWConfig,
     /// Seed of parameters, order and augmentation.
     pub seed: u64,
-    /// Where the network computes.
+    /// Device of the network.
     pub device: Device,
-    /// In which numbers.
+    /// Number format of products.
     pub precision: ComputePrecision,
     /// Threads that prepare batches.
     pub loader_threads: usize,
     /// Folder of checkpoint, curve, weights and model card.
     pub out: PathBuf,
-    /// Whether to go on from the checkpoint in `out`.
+    /// True to resume from the checkpoint in `out`.
     pub resume: bool,
-    /// The command as the user gave it, for the model card.
+    /// The user's command line, for the model card.
     pub command: String,
 }
 
 impl RunConfig {
-    /// One sample at a time on the processor, in single precision, into `out`.
+    /// One sample at a time on the CPU, in single precision, into `out`.
     #[must_use]
     pub fn new(length: Length, out: &Path) -> Self {
         Self {
@@ -54,28 +54,28 @@ impl RunConfig {
         }
     }
 
-    /// Makes the folder of the results and seeds the tensor library: comes before any parameter is drawn.
+    /// Creates the folder of the results and seeds the tensor library; must precede the first draw of a parameter.
     ///
     /// # Errors
-    /// [`TrainingError::Io`] when there cannot be such a folder.
+    /// [`TrainingError::Io`] when the folder cannot be created.
     pub fn start(&self) -> Result<(), TrainingError> {
         tch::manual_seed(self.seed as i64);
         std::fs::create_dir_all(&self.out).map_err(|source| TrainingError::Io { path: self.out.clone(), source })
     }
 }
 
-/// In which numbers the products of a training compute.
+/// Number format of the products of a training.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 pub enum ComputePrecision {
     /// Single precision throughout.
     F32,
-    /// Convolutions and products in bfloat16, several times faster where the processor has it; parameters, statistics and
+    /// Convolutions and products in bfloat16, several times faster if the CPU supports it; parameters, statistics and
     /// losses stay single.
     Bf16,
 }
 
 impl ComputePrecision {
-    /// The tensor library's name for it.
+    /// The corresponding type of the tensor library.
     #[must_use]
     pub fn kind(self) -> Kind {
         match self {
@@ -88,16 +88,16 @@ impl ComputePrecision {
 /// Length of a training.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Length {
-    /// So many steps.
+    /// Number of steps.
     Steps(u64),
-    /// So many passes over the data.
+    /// Number of passes over the data.
     Epochs(f64),
-    /// As many steps as fit into a time; the learning rate follows the clock. Not repeatable to the bit.
+    /// As many steps as fit into a time; the learning rate follows the clock. Not bit-reproducible.
     Time(Duration),
 }
 
 impl Length {
-    /// The share that is done, 0 at the start, 1 or more at the end.
+    /// Share of the training that is done, 0 at the start, 1 or more at the end.
     #[must_use]
     pub fn share_done(self, step: u64, epoch: f64, seconds: f64) -> f64 {
         match self {

@@ -1,12 +1,12 @@
-//! The learning rate over a training: one cycle (Smith), up and down along a cosine.
+//! Learning-rate schedule: one cycle (Smith), up and down along a cosine.
 
 use std::f64::consts::PI;
 
-/// Share of the training that the learning rate rises.
+/// Share of the training in which the learning rate rises.
 const RISE: f64 = 0.1;
-/// Where it begins, relative to its peak.
+/// Initial learning rate, relative to its peak.
 const START: f64 = 0.04;
-/// Where it ends, relative to its peak.
+/// Final learning rate, relative to its peak.
 const END: f64 = 1e-3;
 
 /// One cycle of the learning rate.
@@ -17,7 +17,7 @@ pub struct OneCycle {
 }
 
 impl OneCycle {
-    /// The learning rate when a share of the training lies behind, 0..1.
+    /// The learning rate when a share of the training is done, 0..1.
     #[must_use]
     pub fn at(&self, progress: f64) -> f64 {
         let progress = progress.clamp(0.0, 1.0);

@@ -1,5 +1,5 @@
-//! Gradient descent as every training here does it: steps along one cycle of the learning rate, checkpoints that it goes
-//! on from, and weights in the end.
+//! Trainer: gradient descent along one cycle of the learning rate, with checkpoints to resume from, and weights at the
+//! end.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -18,10 +18,10 @@ use super::run_config::RunConfig;
 use super::schedule::OneCycle;
 use crate::weights;
 
-/// Gradients that are not finite in a row before a training gives up.
+/// Number of gradients in a row that are not finite after which a training fails.
 const MAX_SKIPPED: u32 = 20;
 
-/// What a checkpoint remembers beside parameters and moments.
+/// State of a training beside parameters and moments, in its checkpoint.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct Progress {
     step: u64,
@@ -33,16 +33,16 @@ struct Progress {
 }
 
 impl Progress {
-    /// Refuses what was stored by a training with another seed, batch or method.
-    fn check(&self, asked: &Self) -> Result<(), TrainingError> {
+    /// Rejects the state of a training with another seed, batch or method.
+    fn check(&self, requested: &Self) -> Result<(), TrainingError> {
         let text = |method: &Option<String>| method.clone().unwrap_or_default();
         let fields = [
-            ("seed", self.seed.to_string(), asked.seed.to_string()),
-            ("batch", self.batch.to_string(), asked.batch.to_string()),
-            ("method", text(&self.method), text(&asked.method)),
+            ("seed", self.seed.to_string(), requested.seed.to_string()),
+            ("batch", self.batch.to_string(), requested.batch.to_string()),
+            ("method", text(&self.method), text(&requested.method)),
         ];
-        match fields.into_iter().find(|(_, found, asked)| found != asked) {
-            Some((field, found, asked)) => Err(TrainingError::OtherTraining { field, found, asked }),
+        match fields.into_iter().find(|(_, found, requested)| found != requested) {
+            Some((field, found, requested)) => Err(TrainingError::OtherTraining { field, found, asked: requested }),
             None => Ok(()),
         }
     }
@@ -55,11 +55,11 @@ pub struct Trained {
     pub steps: u64,
     /// Seconds spent, in all runs together.
     pub seconds: f64,
-    /// What it learnt from.
+    /// Identity of the training data.
     pub data: DataListing,
-    /// The weights, in half precision.
+    /// Path of the weights, in half precision.
     pub weights: PathBuf,
-    /// Their SHA-256.
+    /// SHA-256 of the weights.
     pub sha256: String,
     /// Number of parameters.
     pub parameters: usize,
@@ -77,11 +77,11 @@ pub struct Trainer {
 }
 
 impl Trainer {
-    /// Begins with `variables` as they are or, where `run` resumes, goes on from its checkpoint. Time counts from `started`;
-    /// `method` is what a checkpoint has to be of where the same network is trained in several ways.
+    /// Starts with `variables` as they are or, if `run` resumes, continues from its checkpoint. Time counts from
+    /// `started`; `method` has to be that of the checkpoint if the same network is trained in several ways.
     ///
     /// # Errors
-    /// [`TrainingError`] when the checkpoint is missing, cut off or of another training.
+    /// [`TrainingError`] when the checkpoint is missing, truncated or of another training.
     pub fn begin(
         run: &RunConfig,
         variables: &VarStore,
@@ -100,7 +100,7 @@ impl Trainer {
         Ok(Self { run: run.clone(), optimizer, progress, skipped: 0, started, seconds_before })
     }
 
-    /// The course so far, in `curve.csv` of the folder of the results.
+    /// Training curve, in `curve.csv` of the folder of the results.
     ///
     /// # Errors
     /// [`TrainingError::Io`] when the file cannot be written.
@@ -121,7 +121,7 @@ impl Trainer {
         self.seconds_before + self.started.elapsed().as_secs_f64()
     }
 
-    /// The share that is done after `epoch` passes over the data, 0 at the start, 1 or more at the end.
+    /// Share of the training that is done after `epoch` passes over the data, 0 at the start, 1 or more at the end.
     #[must_use]
     pub fn share_done(&self, epoch: f64) -> f64 {
         self.run.length.share_done(self.steps(), epoch, self.seconds())
@@ -133,10 +133,10 @@ impl Trainer {
         OneCycle { peak: self.run.learning_rate }.at(share_done)
     }
 
-    /// Descends along the gradient of `loss`, or skips the step where that is not finite. Whether it was taken.
+    /// Descends along the gradient of `loss`, or skips the step if that is not finite. True if the step was taken.
     ///
     /// # Errors
-    /// [`TrainingError::Diverged`] after too many gradients that were not finite, and the tensor library's.
+    /// [`TrainingError::Diverged`] after too many gradients that were not finite, and those of the tensor library.
     pub fn step(&mut self, loss: &Tensor, share_done: f64) -> Result<bool, TrainingError> {
         self.optimizer.zero_grad();
         loss.f_backward()?;
@@ -149,7 +149,7 @@ impl Trainer {
         Ok(taken)
     }
 
-    /// Writes a checkpoint of `variables` and all that is needed to go on from it.
+    /// Writes a checkpoint of `variables` with the state that is needed to resume.
     ///
     /// # Errors
     /// [`TrainingError::Checkpoint`] when the file cannot be written.
@@ -158,7 +158,7 @@ impl Trainer {
         Ok(checkpoint::save(&checkpoint_path(&self.run), variables, &self.optimizer, &self.progress)?)
     }
 
-    /// Writes the weights; their header says `about` what they are, and how they were trained.
+    /// Writes the weights; their header contains `about`, their kind and training.
     ///
     /// # Errors
     /// [`TrainingError::Weights`] when a parameter is not finite or the file cannot be written.
@@ -193,18 +193,18 @@ mod tests {
     use super::*;
 
     #[test]
-    fn progress_of_localizers_and_detectors_is_read_and_another_training_refused() {
+    fn progress_of_localizers_and_detectors_is_read_and_another_training_rejected() {
         let localizer: Progress = serde_json::from_str(r#"{"step":7,"seconds":1.5,"seed":3,"batch":4}"#).unwrap();
         let detector: Progress =
             serde_json::from_str(r#"{"step":7,"seconds":1.5,"seed":3,"batch":4,"method":"max"}"#).unwrap();
         assert!(localizer.check(&Progress { step: 0, seconds: 0.0, ..localizer.clone() }).is_ok());
-        for (asked, said) in [
+        for (requested, expected) in [
             (Progress { seed: 4, ..detector.clone() }, "seed 3, not 4"),
             (Progress { batch: 8, ..detector.clone() }, "batch 4, not 8"),
             (Progress { method: Some("attention".into()), ..detector.clone() }, "method max, not attention"),
         ] {
-            let message = detector.check(&asked).unwrap_err().to_string();
-            assert!(message.contains(said), "{message}");
+            let message = detector.check(&requested).unwrap_err().to_string();
+            assert!(message.contains(expected), "{message}");
         }
     }
 }

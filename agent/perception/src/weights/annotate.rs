@@ -1,4 +1,4 @@
-//! Adding a text to a weights file that is there.
+//! Annotation of an existing weights file with a text.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -12,14 +12,14 @@ use support::atomic_file;
 
 use super::error::WeightsError;
 
-/// Key of the header that metadata lie under.
+/// Key of the header that contains the metadata.
 const METADATA: &str = "__metadata__";
 
-/// Puts a text under a metadata key of a file, in place of one that is there. Tensors stay as they are; the file is
-/// replaced only when the new one is whole. Returns its SHA-256.
+/// Sets the text of a metadata key of a file. Tensors stay as they are; the file is replaced atomically. Returns its
+/// SHA-256.
 ///
 /// # Errors
-/// [`WeightsError`] when the file is missing, no whole safetensors file or not writable.
+/// [`WeightsError`] when the file is missing, not a complete safetensors file or not writable.
 pub fn annotate(path: &Path, key: &str, text: &str) -> Result<String, WeightsError> {
     let io = |source| WeightsError::Io { path: path.to_owned(), source };
     let old = fs::read(path).map_err(io)?;
@@ -34,7 +34,7 @@ pub fn annotate(path: &Path, key: &str, text: &str) -> Result<String, WeightsErr
     Ok(hex(&Sha256::digest(&new)))
 }
 
-/// `file` has been read by the library: its length, its header and its data are sound.
+/// `file` has been read by the library: its length, its header and its data are valid.
 fn annotated(file: &[u8], key: &str, text: &str) -> Result<Vec<u8>, serde_json::Error> {
     let length: [u8; 8] = std::array::from_fn(|byte| file.get(byte).copied().unwrap_or(0));
     let length = u64::from_le_bytes(length) as usize;
@@ -82,7 +82,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_weights_file_is_left_alone() {
+    fn other_files_are_not_changed() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("w.safetensors");
         fs::write(&path, b"12345678 and no header").unwrap();

@@ -1,4 +1,4 @@
-//! What can be wrong with a weights file.
+//! Errors of weights files.
 
 use std::io;
 use std::path::PathBuf;
@@ -8,61 +8,61 @@ use tch::TchError;
 
 use crate::torch_error::first_line;
 
-/// Why parameters could not be read or written. Every message begins with the file.
+/// Error of reading or writing parameters. Every message begins with the file.
 #[derive(Debug, thiserror::Error)]
 pub enum WeightsError {
     /// The file is missing or not readable, or the folder not writable.
     #[error("{}: {source}", path.display())]
     Io {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// What the system said.
+        /// Error of the operating system.
         source: io::Error,
     },
-    /// The file is cut off or no safetensors file.
-    #[error("{}: not a whole safetensors file ({size} bytes): {source}", path.display())]
+    /// The file is truncated or no safetensors file.
+    #[error("{}: not a complete safetensors file ({size} bytes): {source}", path.display())]
     Format {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// Its size.
+        /// Its size, bytes.
         size: usize,
-        /// What is wrong.
+        /// Error of the format.
         source: SafeTensorError,
     },
     /// The weights are those of another network.
     #[error("{}: weights of kind {found:?}, needed are those of kind {expected:?}", path.display())]
     Kind {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// What it holds.
+        /// Kind in the file.
         found: String,
-        /// What is needed.
+        /// Required kind.
         expected: &'static str,
     },
     /// The metadata has no such key.
     #[error("{}: metadata has no key {key:?}; it has {found:?}", path.display())]
     NoMetadata {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// The key looked for.
+        /// Missing key.
         key: String,
-        /// The keys there are.
+        /// Existing keys.
         found: Vec<String>,
     },
-    /// The JSON under a metadata key does not say what is needed.
+    /// The JSON under a metadata key does not have the required form.
     #[error("{}: metadata {key:?}: {source}", path.display())]
     Metadata {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// The key.
+        /// Key of the metadata.
         key: String,
-        /// What is wrong.
+        /// Error of the JSON.
         source: serde_json::Error,
     },
     /// The network has a parameter that the file lacks.
     #[error("{}: tensor {name:?} is missing (the network expects shape {expected:?})", path.display())]
     MissingTensor {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
         /// Name of the tensor.
         name: String,
@@ -72,7 +72,7 @@ pub enum WeightsError {
     /// A tensor of the file was made for another configuration.
     #[error("{}: tensor {name:?} has shape {found:?}, the network expects {expected:?}", path.display())]
     Shape {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
         /// Name of the tensor.
         name: String,
@@ -81,36 +81,36 @@ pub enum WeightsError {
         /// Shape in the network.
         expected: Vec<i64>,
     },
-    /// A tensor is of a type that parameters are not stored in.
+    /// A tensor is of a type that is not valid for parameters.
     #[error("{}: tensor {name:?} is of type {dtype:?}; parameters are F16, BF16, F32 or F64", path.display())]
     Dtype {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
         /// Name of the tensor.
         name: String,
-        /// Its type.
+        /// Type of the tensor.
         dtype: Dtype,
     },
     /// A parameter is NaN or infinite.
     #[error("{}: tensor {name:?} holds {value} at index {index}", path.display())]
     NotFinite {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
         /// Name of the tensor.
         name: String,
-        /// Where.
+        /// Index in row-major order.
         index: usize,
-        /// What.
+        /// Value at the index.
         value: f32,
     },
-    /// The tensor library refused.
+    /// The tensor library failed.
     #[error("{}: tensor {name:?}: {}", path.display(), first_line(source))]
     Tensor {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
         /// Name of the tensor.
         name: String,
-        /// What it said.
+        /// Error of the tensor library.
         source: TchError,
     },
 }

@@ -1,6 +1,6 @@
-//! Trained parameters on disk: safetensors in `f32` or `f16`, with the configuration beside them.
+//! Weights: trained parameters on disk as safetensors in `f32` or `f16`, with their configuration.
 //!
-//! A file is complete alone: the key `config` of its metadata holds the JSON of the configuration that the network is
+//! A file is self-contained: the key `config` of its metadata holds the JSON of the configuration that the network is
 //! built from. Names of the tensors are those of the reference's state dictionary.
 
 mod annotate;
@@ -25,7 +25,7 @@ pub use save::{Precision, save};
 
 /// Metadata key of the configuration.
 pub const CONFIG_KEY: &str = "config";
-/// Metadata key of what the network is for.
+/// Metadata key of the kind of the network.
 pub const KIND_KEY: &str = "kind";
 
 /// One file of parameters, read and checked.
@@ -49,10 +49,10 @@ const MAX_BYTES: u64 = 4 << 30;
 impl Weights {
     /// Reads a whole file.
     ///
-    /// Integer tensors, which only count batches in the reference, are passed over.
+    /// Integer tensors, which only count batches in the reference, are ignored.
     ///
     /// # Errors
-    /// [`WeightsError`] when the file is missing, cut off, or holds values that are no parameters.
+    /// [`WeightsError`] when the file is missing, truncated, or holds values that are no parameters.
     pub fn load(path: &Path) -> Result<Self, WeightsError> {
         let io = |source| WeightsError::Io { path: path.to_owned(), source };
         let bytes = bounded_file::read(path, MAX_BYTES).map_err(io)?;
@@ -70,7 +70,7 @@ impl Weights {
         Ok(Self { path: path.to_owned(), metadata, tensors, sha256: hex(&Sha256::digest(&bytes)) })
     }
 
-    /// SHA-256 of the file, 64 hexadecimal digits: which model it was, for run records and descriptors.
+    /// SHA-256 of the file, 64 hexadecimal digits: identifies the model in run records and descriptors.
     #[must_use]
     pub fn sha256(&self) -> &str {
         &self.sha256
@@ -87,7 +87,7 @@ impl Weights {
         hex(&hash.finalize())
     }
 
-    /// The file.
+    /// Path of the file.
     #[must_use]
     pub fn path(&self) -> &Path {
         &self.path
@@ -98,7 +98,7 @@ impl Weights {
         self.tensors.keys().map(String::as_str)
     }
 
-    /// Whether there is a tensor of that name.
+    /// True if there is a tensor of that name.
     #[must_use]
     pub fn contains(&self, name: &str) -> bool {
         self.tensors.contains_key(name)
@@ -116,10 +116,10 @@ impl Weights {
         self.metadata.get(key).map(String::as_str)
     }
 
-    /// Checks what the network is for, where the file says it.
+    /// Checks the kind of the network, if the file contains it.
     ///
     /// # Errors
-    /// [`WeightsError::Kind`] when it says something else.
+    /// [`WeightsError::Kind`] when it is another one.
     pub fn check_kind(&self, expected: &'static str) -> Result<(), WeightsError> {
         match self.metadata(KIND_KEY) {
             Some(found) if found != expected => {
@@ -140,7 +140,7 @@ impl Weights {
     /// The JSON under a metadata key.
     ///
     /// # Errors
-    /// [`WeightsError::NoMetadata`] when the key is not there, [`WeightsError::Metadata`] when it says something else.
+    /// [`WeightsError::NoMetadata`] when the key is missing, [`WeightsError::Metadata`] when its JSON has another form.
     pub fn metadata_json<T: DeserializeOwned>(&self, key: &str) -> Result<T, WeightsError> {
         let text = self.metadata.get(key).ok_or_else(|| WeightsError::NoMetadata {
             path: self.path.clone(),
@@ -154,10 +154,11 @@ impl Weights {
         })
     }
 
-    /// Copies the parameters into a network; tensors that the network does not have are left alone.
+    /// Copies the parameters into a network; tensors that the network does not have are ignored.
     ///
     /// # Errors
-    /// [`WeightsError::MissingTensor`] or [`WeightsError::Shape`] name what does not fit; nothing is copied then.
+    /// [`WeightsError::MissingTensor`] or [`WeightsError::Shape`] name the tensor that does not fit; nothing is copied
+    /// then.
     pub fn copy_into(&self, network: &VarStore) -> Result<(), WeightsError> {
         self.copy_some_into(network, |_| true)
     }
@@ -307,7 +308,7 @@ mod tests {
     }
 
     #[test]
-    fn missing_and_cut_files_are_named() {
+    fn missing_and_truncated_files_are_named() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("cut.safetensors");
         assert!(matches!(Weights::load(&path), Err(WeightsError::Io { .. })));
@@ -321,7 +322,7 @@ mod tests {
     }
 
     #[test]
-    fn values_that_are_no_numbers_are_neither_written_nor_read() {
+    fn values_that_are_not_finite_are_neither_written_nor_read() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("nan.safetensors");
         let network = network(&small());

@@ -1,4 +1,4 @@
-//! Writing parameters.
+//! Writer of weights files.
 
 use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
@@ -14,19 +14,19 @@ use tch::{Kind, Tensor};
 use super::check_finite;
 use super::error::WeightsError;
 
-/// How parameters lie on disk.
+/// Number format of parameters on disk.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Precision {
-    /// Every bit: checkpoints.
+    /// Single precision, bit-exact: checkpoints.
     Single,
-    /// Half the size: shipped weights. Vectors (norms, biases) and what does not fit into `f16` stay `f32`.
+    /// Half precision: released weights. Vectors (norms, biases) and values out of the range of `f16` stay `f32`.
     Half,
 }
 
 /// Writes all variables of a network.
 ///
-/// `metadata` holds texts for the header; the configuration belongs under [`CONFIG_KEY`](super::CONFIG_KEY). The file appears under its
-/// name only when it is whole.
+/// `metadata` holds texts for the header; the configuration belongs under [`CONFIG_KEY`](super::CONFIG_KEY). The file
+/// is replaced atomically.
 ///
 /// Returns the SHA-256 of the file.
 ///
@@ -54,8 +54,8 @@ pub fn save(
     Ok(hex(&Sha256::digest(&bytes)))
 }
 
-/// The same file with its header in the order of names: the library writes metadata in the order of a hash map, and equal
-/// weights should be equal files.
+/// The same file with its header in the order of names: the library writes metadata in the order of a hash map, and
+/// equal weights should give equal files.
 fn with_sorted_header(bytes: Vec<u8>) -> Vec<u8> {
     let Some((length, rest)) = bytes.split_first_chunk::<8>() else { return bytes };
     let Some((header, data)) = rest.split_at_checked(u64::from_le_bytes(*length) as usize) else { return bytes };

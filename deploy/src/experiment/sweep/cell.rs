@@ -1,4 +1,4 @@
-//! One run of a sweep: computed, and kept on disk under everything that decides it.
+//! One run of a sweep: computed, and cached on disk by all its inputs.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -26,61 +26,61 @@ use super::SweepError;
 use super::grid::{self, Point};
 use super::spec::Experiment;
 use crate::experiment::evaluation::{EvaluationError, EvaluationOptions, judged, metrics};
-use crate::experiment::fingerprint::hash_file;
-use crate::experiment::metrics::Metrics;
-use crate::experiment::weights_choice::weights_of;
+use crate::scenario::fingerprint::hash_file;
+use crate::scenario::weights_choice::weights_of;
+use crate::score::metrics::Metrics;
 
-/// Everything that decides a run.
+/// All inputs of a run, the key of the cache.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct CellKey {
-    /// Its place in the grid.
+    /// Point of the grid.
     pub point: Point,
-    /// The link, all of it.
+    /// Complete settings of the link.
     pub link: LinkConfig,
-    /// SHA-256 of the trace that the link names, where it does.
+    /// SHA-256 of the trace that the link names, if any.
     pub trace_sha256: Option<String>,
-    /// When the ego fuses what.
+    /// Deadline, age and trust settings of the ego.
     pub ego: EgoSettings,
-    /// The protocol that was asked for.
+    /// Requested protocol.
     #[serde(default)]
     pub protocol: ProtocolConfig,
-    /// How long everyone computes.
+    /// Compute times of the stages.
     pub compute: ComputeTimes,
-    /// Where poses come from.
+    /// Pose source.
     pub poses: PoseSourceConfig,
-    /// SHA-256 of each file that poses come from.
+    /// SHA-256 of each file of the pose source.
     pub poses_sha256: Vec<String>,
     /// SHA-256 of the weights.
     pub weights_sha256: String,
-    /// SHA-256 over the part of the data that is looked at ([`dataset::content_sha256`]).
+    /// SHA-256 over the part of the data that is evaluated ([`dataset::content_sha256`]).
     pub data_sha256: String,
-    /// SHA-256 of the program: what another one computed is not taken for its own.
+    /// SHA-256 of the program: results of another one are not reused.
     pub program_sha256: String,
 }
 
-/// A run that is done.
+/// A completed run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Cell {
-    /// What decided it.
+    /// Its inputs.
     pub key: CellKey,
-    /// The numbers.
+    /// Its metrics.
     pub metrics: Metrics,
-    /// Neighbours' messages that were fused, over all frames.
+    /// Number of neighbours' messages that were fused, over all frames.
     pub used: u64,
-    /// What became of the messages that are fused: maps, boxes or points, without the poses' own.
+    /// Counts of the messages that are fused: feature maps, boxes or points, without the pose messages.
     pub messages: MessageCounts,
-    /// How long it took, seconds: for estimates, never for results.
+    /// Compute time, seconds: for estimates, never for results.
     pub wall_seconds: f64,
 }
 
-/// What became of messages.
+/// Message counts.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct MessageCounts {
-    /// Sent, with the air's duplicates.
+    /// Sent, including duplicates by the link.
     pub sent: u64,
     /// Used at least once.
     pub received: u64,
-    /// Not at their end when the scene was.
+    /// In flight at the end of the scene.
     pub in_flight: u64,
     /// Not used, by reason.
     pub dropped: BTreeMap<DropReason, u64>,
@@ -94,7 +94,7 @@ impl From<Counts> for MessageCounts {
 }
 
 impl CellKey {
-    /// The file that the run is kept in.
+    /// Cache file of the run.
     #[must_use]
     pub fn file(&self, folder: &Path) -> PathBuf {
         let text = serde_json::to_string(self).unwrap_or_default();
@@ -105,10 +105,10 @@ impl CellKey {
 }
 
 impl Cell {
-    /// The run as it was kept; nothing where it was not, or is of something else.
+    /// The cached run; `None` if it does not exist, or belongs to other inputs.
     ///
     /// # Errors
-    /// [`SweepError::Spec`] when the file is not one of these.
+    /// [`SweepError::Spec`] when the file is no cached run.
     pub fn read(key: &CellKey, folder: &Path) -> Result<Option<Self>, SweepError> {
         let path = key.file(folder);
         let Ok(text) = fs::read_to_string(&path) else { return Ok(None) };
@@ -117,7 +117,7 @@ impl Cell {
         Ok((cell.key == *key).then_some(cell))
     }
 
-    /// Keeps the run; a file appears only when it is whole.
+    /// Caches the run; the file appears only when it is complete.
     ///
     /// # Errors
     /// [`SweepError::Io`] when it cannot be written.
@@ -128,7 +128,7 @@ impl Cell {
     }
 }
 
-/// Hashes of what runs are made of, each taken once.
+/// Hashes of the inputs of runs, each computed once.
 #[derive(Debug, Clone)]
 pub(super) struct Hashes {
     data_sha256: String,
@@ -149,7 +149,7 @@ impl Hashes {
         Ok(hash)
     }
 
-    /// Everything that decides the run of a point.
+    /// All inputs of the run of a point.
     pub(super) fn key(&mut self, experiment: &Experiment, point: &Point) -> Result<CellKey, SweepError> {
         let (link, folder) = point.link(experiment)?;
         let poses = point.poses(experiment);
@@ -173,7 +173,7 @@ impl Hashes {
     }
 }
 
-/// What the evaluation of a point is told.
+/// Settings of the evaluation of a point.
 pub(super) fn options(experiment: &Experiment, point: &Point, maps: &Path) -> Result<EvaluationOptions, SweepError> {
     let weights = weights_of(&experiment.weights, point.method)?;
     let read = Weights::load(&weights).map_err(EvaluateError::from).map_err(boxed)?;
@@ -194,13 +194,13 @@ pub(super) fn options(experiment: &Experiment, point: &Point, maps: &Path) -> Re
     })
 }
 
-/// Maps are kept exactly, so that they change no result.
+/// Feature maps are cached losslessly, so that the cache changes no result.
 pub(super) fn kept_maps(experiment: &Experiment, folder: &Path) -> KeptMaps {
     let limit_bytes = (experiment.maps_limit_gb * 1e9) as u64;
     KeptMaps { folder: folder.to_owned(), dtype: Dtype::F32, limit_bytes, intensity_scale: IntensityScale::AUTO }
 }
 
-/// Computes the run of a point; `on_frame` is told of every frame.
+/// Computes the run of a point; `on_frame` is called after every frame.
 pub(super) fn compute(
     experiment: &Experiment,
     point: &Point,

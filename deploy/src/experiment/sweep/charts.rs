@@ -1,4 +1,4 @@
-//! Average precision against whatever varies.
+//! Charts of average precision against each axis that varies.
 
 use std::collections::BTreeMap;
 
@@ -8,9 +8,9 @@ use fusion::Exchange;
 use super::cell::Cell;
 use super::grid::Point;
 use super::spec::Experiment;
-use crate::experiment::metrics::Metrics;
+use crate::score::metrics::Metrics;
 
-/// A picture.
+/// One figure.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Figure {
     /// Name of its files.
@@ -18,13 +18,13 @@ pub(super) struct Figure {
     pub(super) charts: Vec<Chart>,
 }
 
-/// Something that a point has a value of.
+/// A quantity that each point has.
 struct Dimension {
     name: &'static str,
     label: &'static str,
     is_logarithmic: bool,
     value: fn(&Cell) -> Option<f64>,
-    /// How it tells series apart, where it is not on the axis.
+    /// Label that distinguishes series by it, if it is not on the axis.
     text: fn(&Point) -> Option<String>,
 }
 
@@ -122,7 +122,7 @@ fn chart(
     precision: fn(&Metrics) -> Option<f64>,
 ) -> Option<Chart> {
     let dimension = &DIMENSIONS[place];
-    // Along bytes the cells of a codec's every value make one line.
+    // Along bytes, the cells of all values of a codec form one line.
     let mut series: Vec<(String, Points)> = Vec::new();
     for cell in cells {
         let (Some(x), Some(y)) = ((dimension.value)(cell), precision(&cell.metrics)) else { continue };
@@ -153,10 +153,10 @@ fn chart(
     Some(Chart { title, x, y: Axis::linear("AP, ordered by score", [0.0, 1.0]), series })
 }
 
-/// The points of a line by what is averaged over seeds.
+/// Points of a line, grouped for the mean over seeds.
 type Points = BTreeMap<Key, Vec<(f64, f64)>>;
 
-/// What is averaged over seeds.
+/// Group of the mean over seeds.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 enum Key {
     Value(u64),
@@ -172,7 +172,7 @@ fn line(name: String, points: Points) -> Series {
     Series { name, points, mark: Mark::LineAndDots }
 }
 
-/// Ends of an axis: from 0 unless all values lie far from it, and wider than nothing.
+/// Ends of an axis: from 0 unless all values are far from it, and of a width above 0.
 fn span(low: f64, high: f64, is_far_from_zero: bool) -> [f64; 2] {
     let from = if is_far_from_zero { low.floor() } else { 0.0 };
     [from, if high > from { high } else { from + 1.0 }]

@@ -1,4 +1,4 @@
-//! What makes no experiment: values out of bounds, fields that contradict each other, grids that nobody can wait for.
+//! Checks of an experiment: values out of bounds, contradictory fields, grids that take too long.
 
 use std::fmt::Debug;
 
@@ -10,10 +10,10 @@ use link::{CapacityConfig, DelayModel, LinkConfig, LossModel};
 use super::spec::{CodecSpec, Experiment, Grid, NoiseSpec};
 use localization::pose_source::{NoiseMode, PoseSourceConfig};
 
-/// More runs than this are a mistake.
+/// Largest number of runs; more are a mistake.
 pub(super) const MOST_RUNS: usize = 10_000;
 
-/// Checks everything that can be said without looking at the data.
+/// Checks everything that does not depend on the data.
 pub(super) fn check(experiment: &Experiment) -> Result<(), String> {
     let Experiment { name, grid, ego, poses, compute, maps_limit_gb, scenarios, ticks, .. } = experiment;
     let is_name = |c: char| c.is_ascii_alphanumeric() || c == '-' || c == '_';
@@ -22,7 +22,7 @@ pub(super) fn check(experiment: &Experiment) -> Result<(), String> {
     }
     for (field, value) in [("scenarios", scenarios), ("ticks", ticks)] {
         if *value == Some(0) {
-            return Err(format!("{field} is 0: there would be nothing to judge"));
+            return Err(format!("{field} is 0: there would be nothing to evaluate"));
         }
     }
     ego.validate().map_err(|error| error.to_string())?;
@@ -45,7 +45,7 @@ pub(super) fn check(experiment: &Experiment) -> Result<(), String> {
     Ok(())
 }
 
-/// Checks what depends on the data.
+/// Checks everything that depends on the data.
 pub(super) fn check_scenes(experiment: &Experiment, scenarios: &[Scenario]) -> Result<(), String> {
     for scenario in scenarios {
         let found = scenario.agents.len();
@@ -57,7 +57,7 @@ pub(super) fn check_scenes(experiment: &Experiment, scenarios: &[Scenario]) -> R
     Ok(())
 }
 
-/// Every axis alone.
+/// Checks every axis on its own.
 fn axes(grid: &Grid) -> Result<(), String> {
     let Grid { method, codec, latency_ms, jitter_ms, bandwidth_mbps, loss, pose_noise, agents, seed } = grid;
     values("grid.method", Some(method), |_| Ok(()))?;
@@ -85,27 +85,28 @@ fn axes(grid: &Grid) -> Result<(), String> {
     values("grid.seed", seed.as_ref(), |_| Ok(()))
 }
 
-/// Fields that say two things, or ask for what cannot be.
+/// Contradictory or impossible combinations of fields.
 fn contradictions(experiment: &Experiment, link: &LinkConfig) -> Result<(), String> {
     let Experiment { grid, ego, poses, link: name, .. } = experiment;
-    let says = |axis: &str, field: &str| Err(format!("{axis} and the {field} of link {name} contradict each other"));
+    let contradiction =
+        |axis: &str, field: &str| Err(format!("{axis} and the {field} of link {name} contradict each other"));
     if let Some(ego) = &ego.id {
         return Err(format!("ego.id is {ego}: choose by protocol.ego instead"));
     }
     if ego.inbox != InboxConfig::default() {
-        return Err("ego.inbox is given, but virtual time knows no limits of what others send".into());
+        return Err("ego.inbox is given, but receive limits do not apply in simulation time".into());
     }
     if experiment.noise_mode == NoiseMode::Replayed {
         return Err("noise_mode is replayed, which needs a table: name it in poses instead".into());
     }
     if grid.latency_ms.is_some() && link.delay != DelayModel::None {
-        return says("grid.latency_ms", "delay");
+        return contradiction("grid.latency_ms", "delay");
     }
     if grid.bandwidth_mbps.is_some() && link.capacity != CapacityConfig::Unlimited {
-        return says("grid.bandwidth_mbps", "capacity");
+        return contradiction("grid.bandwidth_mbps", "capacity");
     }
     if grid.loss.is_some() && link.loss != LossModel::None {
-        return says("grid.loss", "loss");
+        return contradiction("grid.loss", "loss");
     }
     if grid.jitter_ms.is_some() && grid.latency_ms.is_none() {
         return Err("grid.jitter_ms is the deviation of grid.latency_ms, which is left out".into());
@@ -116,7 +117,7 @@ fn contradictions(experiment: &Experiment, link: &LinkConfig) -> Result<(), Stri
     if let Some(ms) = grid.latency_ms.iter().flatten().find(|ms| **ms > ego.max_age_ms as f64 + ego.deadline_ms as f64)
     {
         return Err(format!(
-            "grid.latency_ms is {ms}, but ego.max_age_ms is {}: nothing would ever be young enough to be fused",
+            "grid.latency_ms is {ms}, but ego.max_age_ms is {}: every message would be too old to be fused",
             ego.max_age_ms
         ));
     }
@@ -125,10 +126,13 @@ fn contradictions(experiment: &Experiment, link: &LinkConfig) -> Result<(), Stri
     }
     if grid.codec.is_some() && grid.method.iter().all(|method| method.exchange() != Exchange::Features) {
         let names: Vec<&str> = grid.method.iter().map(|method| method.name()).collect();
-        return Err(format!("grid.codec is how maps are written, but grid.method ({}) sends none", names.join(", ")));
+        return Err(format!(
+            "grid.codec varies the encoding of feature maps, but grid.method ({}) sends none",
+            names.join(", ")
+        ));
     }
     if grid.method.iter().all(|method| method.exchange() == Exchange::Nothing) && grid.agents.is_some() {
-        return Err("grid.agents varies who talks, but grid.method is none: nobody does".into());
+        return Err("grid.agents varies the transmitting vehicles, but grid.method is none: there are none".into());
     }
     let jitters = grid.jitter_ms.iter().flatten().any(|ms| *ms > 0.0);
     let loses = grid.loss.iter().flatten().any(|share| *share > 0.0 && *share < 1.0);
@@ -145,7 +149,7 @@ fn is_random(link: &LinkConfig) -> bool {
     delay || link.loss != LossModel::None || link.reorder.is_some() || link.duplicate > 0.0
 }
 
-/// Checks each value of an axis, and that there are some and none twice.
+/// Checks each value of an axis: at least one, and no duplicates.
 fn values<T: PartialEq + Debug>(
     field: &str,
     values: Option<&Vec<T>>,
@@ -189,7 +193,7 @@ mod tests {
     #[test]
     fn every_contradiction_is_named_by_its_fields() {
         assert_eq!(problem("grid: {method: [max]}"), "");
-        for (text, words) in [
+        for (text, message) in [
             ("grid: {method: []}", "grid.method is empty"),
             ("grid: {method: [max], loss: [0, 1.5]}", "grid.loss is 1.5"),
             ("grid: {method: [max], loss: [0.1, 0.1]}", "grid.loss names 0.1 twice"),
@@ -213,12 +217,12 @@ mod tests {
             ("ticks: 0\ngrid: {method: [max]}", "ticks is 0"),
         ] {
             let problem = problem(text);
-            assert!(problem.contains(words), "{text}: {problem}");
+            assert!(problem.contains(message), "{text}: {problem}");
         }
     }
 
     #[test]
-    fn a_grid_that_nobody_can_wait_for_is_refused_with_its_size() {
+    fn a_grid_that_takes_too_long_is_refused_with_its_size() {
         let many = (0..101).map(|k| k.to_string()).collect::<Vec<_>>().join(", ");
         let text = format!("grid: {{method: [max], latency_ms: [{many}], seed: [{many}], jitter_ms: [1]}}");
         let problem = problem(&text);

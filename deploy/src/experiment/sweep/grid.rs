@@ -1,4 +1,4 @@
-//! The runs of a grid, in order.
+//! Runs of a grid, in order.
 
 use std::path::PathBuf;
 
@@ -17,27 +17,27 @@ use super::spec::{CodecSpec, Experiment, Grid, NoiseSpec};
 /// One point of a grid.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Point {
-    /// Method.
+    /// Fusion method.
     pub method: Method,
-    /// How maps are written.
+    /// Encoding of feature maps.
     pub codec: CodecSpec,
-    /// Mean delay, milliseconds; absent: as the link says. The same for those below.
+    /// Mean delay, milliseconds; absent: that of the link. The same for those below.
     pub latency_ms: Option<f64>,
     /// Its standard deviation, milliseconds.
     pub jitter_ms: Option<f64>,
-    /// Rate, Mbit/s; absent where unlimited too, as JSON knows no infinity.
+    /// Rate, Mbit/s; absent for unlimited too, as JSON has no infinity.
     pub bandwidth_mbps: Option<f64>,
-    /// Share of the messages that get lost.
+    /// Fraction of the messages that are lost.
     pub loss: Option<f64>,
     /// Error of the poses.
     pub pose_noise: Option<NoiseSpec>,
-    /// Vehicles that take part; absent: all.
+    /// Number of participating vehicles; absent: all.
     pub agents: Option<usize>,
-    /// Seed.
+    /// Seed of losses, delays and pose errors.
     pub seed: u64,
 }
 
-/// Values of each axis.
+/// Number of values of each axis.
 pub(super) fn sizes(grid: &Grid) -> Vec<(&'static str, usize)> {
     let size = |length: Option<usize>| length.unwrap_or(1);
     vec![
@@ -53,12 +53,12 @@ pub(super) fn sizes(grid: &Grid) -> Vec<(&'static str, usize)> {
     ]
 }
 
-/// Points of the grid.
+/// Number of points of the grid.
 pub(super) fn count(grid: &Grid) -> usize {
     sizes(grid).into_iter().fold(1, |product, (_, size)| product.saturating_mul(size))
 }
 
-/// Every point, the last field turning fastest.
+/// Every point; the last field varies fastest.
 #[must_use]
 pub fn points(grid: &Grid) -> Vec<Point> {
     let mut points: Vec<Point> = Vec::new();
@@ -103,7 +103,7 @@ fn spread<T: Copy>(points: Vec<Point>, values: Option<&[T]>, set: impl Fn(&mut P
 }
 
 impl Point {
-    /// The link of this point: the experiment's with what the grid says.
+    /// The link of this point: that of the experiment with the values of the grid.
     ///
     /// # Errors
     /// [`LinkError`] when the experiment's is not readable.
@@ -125,7 +125,7 @@ impl Point {
         Ok((link, folder))
     }
 
-    /// Where poses come from.
+    /// Pose source of this point.
     #[must_use]
     pub fn poses(&self, experiment: &Experiment) -> PoseSourceConfig {
         let Some(NoiseSpec { position_std_m, heading_std_deg }) = self.pose_noise else {
@@ -141,7 +141,7 @@ impl Point {
         })
     }
 
-    /// How maps of `channels` on `grid` are written.
+    /// Encoding of feature maps of `channels` on `grid`.
     #[must_use]
     pub fn codec(&self, grid: BevGrid, channels: u64) -> CodecConfig {
         let CodecSpec { dtype, keep, zstd_level, fit: _ } = self.codec;
@@ -156,7 +156,7 @@ impl Point {
         CodecConfig { dtype, gate: None, budget_bytes, zstd_level }
     }
 
-    /// What maps are fitted to: nothing where they are not, or where the link takes anything.
+    /// Rate that feature maps are adapted to; empty without adaptation, or if the link is unlimited.
     #[must_use]
     pub fn rate(&self) -> RateConfig {
         let share = self.codec.fit.zip(self.bandwidth_mbps);
@@ -167,7 +167,7 @@ impl Point {
     }
 }
 
-/// Virtual time for a point.
+/// Simulation-time settings of a point.
 pub(super) fn stepped(
     (link, link_folder): (LinkConfig, PathBuf),
     point: &Point,

@@ -1,4 +1,4 @@
-//! `report.html`: figures, table and what they were made of, in one file that needs no other.
+//! `report.html`: figures, table and provenance, in one self-contained file.
 
 use std::fmt::Write as _;
 
@@ -12,7 +12,7 @@ const STYLE: &str = "body{font:16px/1.5 system-ui,sans-serif;margin:2rem auto;ma
     th,td{padding:.2rem .6rem;text-align:right;border-bottom:1px solid #e2e5ea}th{position:sticky;top:0;background:#fff}\
     pre{background:#f5f6f8;padding:1rem;overflow-x:auto;font-size:.85rem}dt{font-weight:600}dd{margin:0 0 .4rem 1rem}";
 
-/// The page of an experiment, whose file says `spec`, with the SVG of its figures.
+/// Page of an experiment with the file content `spec` and the SVG of its figures.
 // Writing to a string cannot fail.
 pub(super) fn page(experiment: &Experiment, spec: &str, cells: &[Cell], figures: &[String]) -> String {
     let title = if experiment.title.is_empty() { &experiment.name } else { &experiment.title };
@@ -25,7 +25,7 @@ pub(super) fn page(experiment: &Experiment, spec: &str, cells: &[Cell], figures:
     let frames = cells.first().map_or(0, |cell| cell.metrics.frames);
     let _ = writeln!(
         page,
-        "<p>{} runs of {frames} frames in virtual time; means over seeds in the figures. The table is \
+        "<p>{} runs of {frames} frames in simulation time; means over seeds in the figures. The table is \
          <code>{}.csv</code>.</p>",
         cells.len(),
         escaped(&experiment.name)
@@ -37,7 +37,7 @@ pub(super) fn page(experiment: &Experiment, spec: &str, cells: &[Cell], figures:
     let cells_of = |tag: &str, fields: &mut dyn Iterator<Item = String>| {
         fields.map(|field| format!("<{tag}>{}</{tag}>", escaped(&field))).collect::<String>()
     };
-    page += "<h2>RunScope</h2>\n<div class=\"wide\"><table><thead><tr>";
+    page += "<h2>Runs</h2>\n<div class=\"wide\"><table><thead><tr>";
     page += &cells_of("th", &mut columns.iter().map(|column| column.trim().to_owned()));
     page += "</tr></thead><tbody>\n";
     for line in lines {
@@ -55,7 +55,7 @@ pub(super) fn page(experiment: &Experiment, spec: &str, cells: &[Cell], figures:
     page
 }
 
-/// Text that means itself inside of markup.
+/// Text with the special characters of markup escaped.
 fn escaped(text: &str) -> String {
     text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
 }

@@ -1,7 +1,7 @@
-//! Sweeps: a grid of runs in virtual time, one CSV, charts, a report.
+//! Sweeps: a grid of runs in simulation time, one CSV, charts, a report.
 //!
-//! RunScope are kept one by one under all that decides them, so that an interrupted sweep goes on where it was. The same
-//! experiment gives the same CSV, byte for byte, in one process or in many.
+//! Runs are cached one by one by all their inputs, so that an interrupted sweep resumes. The same experiment gives the
+//! same CSV, byte for byte, with one process or with many.
 
 mod cell;
 mod charts;
@@ -35,37 +35,37 @@ pub use spec::{CodecSpec, Experiment, Generate, Grid, NoiseSpec};
 pub use table::csv;
 
 use crate::experiment::evaluation::{EvaluationError, evaluate};
-use crate::experiment::weights_choice::{WeightsChoiceError, weights_of};
+use crate::scenario::weights_choice::{WeightsChoiceError, weights_of};
 
-/// Ticks that are timed before a sweep begins, for its estimate.
+/// Number of ticks that are timed before a sweep begins, for its estimate.
 const PROBED_TICKS: usize = 4;
 
-/// What came of a sweep.
+/// Result of a sweep.
 #[derive(Debug, Default)]
 pub struct Swept {
     /// The table, as CSV.
     pub table: String,
-    /// What each run left out of the data set.
+    /// Data that each run left out.
     pub left_out: Vec<LeftOut>,
 }
 
-/// Why a sweep came to nothing.
+/// Reason why a sweep failed.
 #[derive(Debug, thiserror::Error)]
 pub enum SweepError {
-    /// The system refused.
+    /// Error of the operating system.
     #[error("{}: {source}", path.display())]
     Io {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// What the system said.
+        /// Error of the operating system.
         source: io::Error,
     },
-    /// A file does not say what it should.
+    /// A file has invalid content.
     #[error("{}: {problem}", path.display())]
     Spec {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// The field, and what is wrong with it.
+        /// The field, and the error.
         problem: String,
     },
     /// The experiment cannot be read.
@@ -95,21 +95,21 @@ pub enum SweepError {
 }
 
 impl SweepError {
-    /// Whether the input is at fault, and not the run.
+    /// True if the input is at fault, and not the run.
     #[must_use]
     pub fn is_bad_input(&self) -> bool {
         !matches!(self, Self::Worker(_) | Self::Chart(_))
     }
 }
 
-/// How a sweep is to be run.
+/// Settings of a sweep.
 #[derive(Debug, Clone)]
 pub struct SweepOptions {
-    /// Where everything goes.
+    /// Folder of the results.
     pub out: PathBuf,
-    /// Processes that compute.
+    /// Number of compute processes.
     pub jobs: usize,
-    /// Only say what there is to do.
+    /// Only print the number of missing runs.
     pub dry_run: bool,
 }
 
@@ -119,16 +119,16 @@ pub struct Sweep {
     file: PathBuf,
     experiment: Experiment,
     points: Vec<Point>,
-    /// All scenarios of the data set, of which maps are kept.
+    /// All scenarios of the data set, for which feature maps are cached.
     all: Vec<Scenario>,
-    /// Those that are judged.
+    /// The evaluated scenarios.
     scenarios: Vec<Scenario>,
     keys: Vec<CellKey>,
     out: PathBuf,
 }
 
 impl Sweep {
-    /// Reads an experiment, generates its data where it asks for that, and checks the one against the other.
+    /// Reads an experiment, generates its data if requested, and checks the one against the other.
     ///
     /// # Errors
     /// [`SweepError`] names the file and the field.
@@ -150,7 +150,7 @@ impl Sweep {
         Ok(Self { file, experiment, points, all, scenarios, keys, out })
     }
 
-    /// What is there already, by place in the grid.
+    /// Cached runs, by place in the grid.
     fn known(&self) -> Result<Vec<Option<Cell>>, SweepError> {
         self.keys.iter().map(|key| Cell::read(key, &self.cells())).collect()
     }
@@ -167,10 +167,10 @@ impl Sweep {
         self.scenarios.iter().map(|scenario| scenario.ticks.len()).sum()
     }
 
-    /// RunScope what is missing and writes table, charts and report.
+    /// Computes the missing runs and writes table, charts and report.
     ///
     /// # Errors
-    /// [`SweepError`] at the first run that cannot be computed; those before it are kept.
+    /// [`SweepError`] at the first run that cannot be computed; earlier runs are cached.
     pub fn run(&self, options: &SweepOptions) -> Result<Swept, SweepError> {
         fs::create_dir_all(self.cells()).map_err(|source| SweepError::Io { path: self.cells(), source })?;
         let known = self.known()?;
@@ -189,7 +189,7 @@ impl Sweep {
         })
     }
 
-    /// Says how many runs there are and how long they will take.
+    /// Prints the number of runs and the estimated time.
     fn announce(&self, known: &[Option<Cell>], missing: &[usize], options: &SweepOptions) -> Result<(), SweepError> {
         let (runs, frames) = (known.len(), self.frames());
         output::note(format_args!(
@@ -209,7 +209,7 @@ impl Sweep {
         Ok(())
     }
 
-    /// Seconds a frame takes, from the first few, without kept maps: longer rather than shorter.
+    /// Time of a frame, seconds, from the first few without cached feature maps: an overestimate.
     fn probe(&self, point: &Point) -> Result<f64, SweepError> {
         let mut options = cell::options(&self.experiment, point, &self.maps())?;
         options.maps = None;
@@ -220,7 +220,7 @@ impl Sweep {
         Ok(began.elapsed().as_secs_f64() / metrics.frames.max(1) as f64)
     }
 
-    /// Computes the maps of all sweeps, once for each encoder that is needed.
+    /// Computes the feature maps of all sweeps, once for each encoder that is needed.
     fn encode(&self, missing: &[usize]) -> Result<(), SweepError> {
         let methods = missing.iter().map(|&index| self.points[index].method);
         let mut files = Vec::new();
@@ -273,29 +273,29 @@ impl Sweep {
         cell::compute(&self.experiment, point, key, &self.maps(), on_frame)?.write(&self.cells())
     }
 
-    /// Does as another process asks.
+    /// Runs as a worker: computes the points that the parent process requests.
     ///
     /// # Errors
-    /// [`SweepError::Io`] when the other end is gone.
+    /// [`SweepError::Io`] when the parent process has ended.
     pub fn work(&self) -> Result<(), SweepError> {
-        let gone = |source| SweepError::Io { path: "the sweep that asked".into(), source };
-        let say = |word: &str| {
+        let gone = |source| SweepError::Io { path: "the parent sweep".into(), source };
+        let reply = |line: &str| {
             let mut output = io::stdout().lock();
-            writeln!(output, "{word}").and_then(|()| output.flush())
+            writeln!(output, "{line}").and_then(|()| output.flush())
         };
         for line in io::stdin().lock().lines() {
             let index: Option<usize> = line.map_err(gone)?.trim().parse().ok();
             let Some(index) = index.filter(|index| *index < self.points.len()) else {
-                say(&format!("{} that is no point of the grid", workers::FAILED)).map_err(gone)?;
+                reply(&format!("{} that is no point of the grid", workers::FAILED)).map_err(gone)?;
                 continue;
             };
-            // Who asks may be gone; then the answer to the run fails too.
-            let computed = self.compute_one(index, &mut || say(workers::FRAME).unwrap_or_default());
+            // The parent may have ended; then the answer to the run fails too.
+            let computed = self.compute_one(index, &mut || reply(workers::FRAME).unwrap_or_default());
             let answer = match computed {
                 Ok(()) => workers::DONE.to_owned(),
                 Err(error) => format!("{} {error}", workers::FAILED),
             };
-            say(&answer).map_err(gone)?;
+            reply(&answer).map_err(gone)?;
         }
         Ok(())
     }
@@ -322,7 +322,7 @@ impl Sweep {
     }
 }
 
-/// Generates the data set where it is asked for and not there.
+/// Generates the data set if it is requested and does not exist.
 fn generate(experiment: &Experiment) -> Result<(), SweepError> {
     let Some(generate) = &experiment.generate else { return Ok(()) };
     let options = SynthOptions {

@@ -1,4 +1,4 @@
-//! `EXPERIMENT.yaml`: what is held fast, and the grid of what varies.
+//! `EXPERIMENT.yaml`: fixed settings, and the grid of the varied ones.
 
 use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
@@ -28,39 +28,39 @@ pub struct Experiment {
     pub title: String,
     /// Data set, split or scenario, relative to the file; the first vehicle of each scenario is the ego.
     pub dataset: PathBuf,
-    /// What to generate at `dataset` when nothing is there.
+    /// Settings of the generator for a `dataset` that does not exist.
     #[serde(default)]
     pub generate: Option<Generate>,
-    /// So many scenarios, evenly spread; all where absent.
+    /// Number of scenarios, evenly spread; absent: all.
     #[serde(default)]
     pub scenarios: Option<usize>,
-    /// The first so many ticks of each; all where absent.
+    /// Number of ticks from the start of each scenario; absent: all.
     #[serde(default)]
     pub ticks: Option<usize>,
-    /// Whose messages and annotations count, and which objects.
+    /// Participating vehicles, counted annotations and objects.
     #[serde(default)]
     pub protocol: ProtocolConfig,
     /// Weights, or a folder with a file `*-METHOD.safetensors` for each method, relative to the file.
     pub weights: PathBuf,
-    /// Where poses come from, unless the grid has pose noise.
+    /// Pose source, unless the grid has pose noise.
     #[serde(default)]
     pub poses: PoseSourceConfig,
-    /// How the errors of successive frames hang together, where the grid has pose noise.
+    /// Correlation of the errors of successive frames, if the grid has pose noise.
     #[serde(default)]
     pub noise_mode: NoiseMode,
-    /// Deadline, age and trust of the ego; which vehicle it is, `protocol.ego` says.
+    /// Deadline, age and trust of the ego; `protocol.ego` selects the vehicle.
     #[serde(default)]
     pub ego: EgoSettings,
-    /// How long everyone computes.
+    /// Compute times of the stages.
     #[serde(default = "no_time")]
     pub compute: ComputeTimes,
     /// The link that the grid varies: a preset of `sim-replay link`, or a file relative to this one.
     #[serde(default = "ideal")]
     pub link: String,
-    /// Most gigabytes of maps that are kept per encoder, so that sweeps are encoded once for all runs.
+    /// Largest cache of feature maps per encoder, gigabytes, so that sweeps are encoded once for all runs.
     #[serde(default = "gigabytes")]
     pub maps_limit_gb: f64,
-    /// What varies.
+    /// Axes that vary.
     pub grid: Grid,
 }
 
@@ -70,29 +70,29 @@ pub struct Experiment {
 pub struct Generate {
     /// Seed of routes and traffic; 1000 and above are for measuring.
     pub seed: u64,
-    /// Scenarios.
+    /// Number of scenarios.
     pub scenarios: usize,
-    /// Frames of each.
+    /// Number of frames of each.
     pub frames: usize,
-    /// Fewest and most vehicles of a scenario.
+    /// Smallest and largest number of vehicles of a scenario.
     pub agents: [usize; 2],
 }
 
 impl Generate {
-    /// Fewest to most vehicles.
+    /// Smallest to largest number of vehicles.
     #[must_use]
     pub fn agents(&self) -> RangeInclusive<usize> {
         self.agents[0]..=self.agents[1]
     }
 }
 
-/// What varies: every value of each field with every value of the others. What is left out is as the link says.
+/// Axes of the grid: every value of each field with every value of the others. An absent axis is as in the link.
 #[derive(Debug, Clone, PartialEq, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Grid {
-    /// Methods.
+    /// Fusion methods.
     pub method: Vec<Method>,
-    /// How maps are written.
+    /// Encodings of feature maps.
     #[serde(default)]
     pub codec: Option<Vec<CodecSpec>>,
     /// Mean delay after the last bit was sent, milliseconds.
@@ -104,13 +104,13 @@ pub struct Grid {
     /// Rate of each link, Mbit/s; `.inf`: unlimited.
     #[serde(default)]
     pub bandwidth_mbps: Option<Vec<f64>>,
-    /// Share of the messages that get lost.
+    /// Fraction of the messages that are lost.
     #[serde(default)]
     pub loss: Option<Vec<f64>>,
     /// Errors of the poses.
     #[serde(default)]
     pub pose_noise: Option<Vec<NoiseSpec>>,
-    /// Vehicles that take part, the ego counted; all where absent.
+    /// Number of participating vehicles, the ego included; absent: all.
     #[serde(default)]
     pub agents: Option<Vec<usize>>,
     /// Seeds of losses, delays and pose errors.
@@ -118,19 +118,20 @@ pub struct Grid {
     pub seed: Option<Vec<u64>>,
 }
 
-/// How maps are written.
+/// Encoding of feature maps.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct CodecSpec {
-    /// How exactly.
+    /// Number format of the values.
     pub dtype: Dtype,
-    /// Share of the cells that are sent, those with the highest confidence; all where absent.
+    /// Fraction of the cells that are sent, those with the highest confidence; absent: all.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub keep: Option<f64>,
     /// zstd level, 1 to 22. Absent: not compressed.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub zstd_level: Option<i32>,
-    /// Share of the link's rate that maps are fitted to, in coarser numbers and then with fewer cells; not fitted where absent.
+    /// Fraction of the link's rate that feature maps are adapted to, by coarser numbers and then fewer cells; absent:
+    /// not adapted.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub fit: Option<f64>,
 }
@@ -142,7 +143,7 @@ impl Default for CodecSpec {
 }
 
 impl CodecSpec {
-    /// What tables and charts call it: its numbers, and the share of the link that maps are fitted to.
+    /// Label in tables and charts: the number format, and the fraction of the link's rate.
     #[must_use]
     pub fn name(&self) -> String {
         let fitted = self.fit.map_or(String::new(), |share| format!(" fitted to {share}"));
@@ -173,8 +174,8 @@ fn gigabytes() -> f64 {
 }
 
 impl Experiment {
-    /// Reads and checks an experiment. Relative paths in it are taken from its folder, but for files of `poses`, which
-    /// go by the working directory as on the command line.
+    /// Reads and checks an experiment. Relative paths are resolved against its folder, except for files of `poses`,
+    /// which are resolved against the working directory as on the command line.
     ///
     /// # Errors
     /// [`SweepError`] names the file and the field.
@@ -192,7 +193,7 @@ impl Experiment {
         Ok(experiment)
     }
 
-    /// The part of the data set that is looked at.
+    /// The part of the data set that is evaluated.
     #[must_use]
     pub fn part(&self) -> crate::experiment::evaluation::Part {
         crate::experiment::evaluation::Part { scenarios: self.scenarios, ticks: self.ticks, ..Default::default() }

@@ -1,4 +1,4 @@
-//! The runs of a sweep as one CSV, a line each, in the order of the grid.
+//! Runs of a sweep as one CSV, a line each, in the order of the grid.
 
 use fusion::Exchange;
 use protocol::DropReason;
@@ -6,9 +6,9 @@ use support::csv_file::CsvText;
 
 use super::cell::Cell;
 use super::spec::Experiment;
-use crate::experiment::metrics::ByIou;
+use crate::score::metrics::ByIou;
 
-/// Reasons with a column of their own; the others are added up in the last.
+/// Reasons with a column of their own; the last column is the sum of the others.
 const REASONS: [DropReason; 7] = [
     DropReason::LinkLoss,
     DropReason::LinkQueue,
@@ -19,16 +19,16 @@ const REASONS: [DropReason; 7] = [
     DropReason::OutOfRange,
 ];
 
-/// The names of the columns.
+/// Names of the columns.
 const COLUMNS: &str = "method,dtype,keep,zstd,latency_ms,jitter_ms,bandwidth_mbps,loss,noise_t,noise_r,agents,seed,frames,\
     ap_global_30,ap_global_50,ap_global_70,ap_frame_30,ap_frame_50,ap_frame_70,payload_bytes,wire_bytes,log2_payload,\
     log2_wire,log2_frame,log2_fp32,nominal_fp32_log2,e2e_ms_p50,e2e_ms_p95,e2e_ms_p99,age_ms_p50,age_ms_p95,frames_used,\
     stale,sent,received,in_flight,dropped_link_loss,dropped_link_queue,dropped_superseded,dropped_stale,dropped_duplicate,\
     dropped_no_pose,dropped_out_of_range,dropped_other";
 
-/// What the columns say that their names do not.
+/// Definitions of columns whose names are not enough.
 pub(super) const NOTES: &[(&str, &str)] = &[
-    ("latency_ms, bandwidth_mbps, loss", "empty: as the experiment's link says; inf: unlimited"),
+    ("latency_ms, bandwidth_mbps, loss", "empty: as in the experiment's link; inf: unlimited"),
     ("noise_t, noise_r", "standard deviation of the poses' errors, metres and degrees"),
     ("ap_global, ap_frame", "average precision ordered by score over all frames, and ordered by frame as in OpenCOOD"),
     (
@@ -39,14 +39,17 @@ pub(super) const NOTES: &[(&str, &str)] = &[
     ("log2_frame", "binary logarithm of the wire bytes that an ego used per frame, of all neighbours together"),
     (
         "log2_fp32",
-        "binary logarithm of the sent values at 4 bytes each, as Where2comm counts; empty where bytes do not tell how many \
-         there are: packed, or fitted to the link",
+        "binary logarithm of the sent values at 4 bytes each, as Where2comm counts; empty where their number does \
+         not follow from the bytes: packed, or adapted to the link",
     ),
-    ("nominal_fp32_log2", "binary logarithm of a whole map at 4 bytes a value, whatever was sent"),
-    ("e2e_ms", "from the capture of the ego's sweep to the publication of its detections, virtual time"),
+    (
+        "nominal_fp32_log2",
+        "binary logarithm of a complete feature map at 4 bytes a value, independent of what was sent",
+    ),
+    ("e2e_ms", "from the capture of the ego's sweep to the publication of its detections, simulation time"),
     ("age_ms", "capture time of the ego's sweep less that of the fused neighbour's"),
     ("frames_used", "neighbours' messages fused, over all frames; one may serve several frames"),
-    ("sent, received, in_flight, dropped", "maps, boxes or points of neighbours, each counted once"),
+    ("sent, received, in_flight, dropped", "feature maps, boxes or points of neighbours, each counted once"),
 ];
 
 /// The whole table.
@@ -57,7 +60,7 @@ pub fn csv(experiment: &Experiment, cells: &[Cell]) -> String {
     text.finish()
 }
 
-/// The names of the columns, and the fields of each line.
+/// Names of the columns, and the fields of each line.
 pub(super) fn rows(experiment: &Experiment, cells: &[Cell]) -> (Vec<&'static str>, Vec<Vec<String>>) {
     (COLUMNS.split(',').collect(), cells.iter().map(|cell| line(experiment, cell)).collect())
 }
@@ -109,7 +112,7 @@ fn text(count: u64) -> String {
     count.to_string()
 }
 
-/// As short as it can be written.
+/// Shortest decimal text of a value.
 fn plain(value: Option<f64>) -> String {
     value.map_or(String::new(), |value| value.to_string())
 }

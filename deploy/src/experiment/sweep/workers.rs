@@ -1,7 +1,7 @@
-//! RunScope of a sweep in several processes, each with one thread that computes.
+//! Worker processes of a sweep, each with one compute thread.
 //!
-//! A worker is this program with `--worker`: it reads the number of a point from standard input, computes the run, keeps
-//! it, and answers on standard output: `frame` for each frame, then `done`, or `failed` with the reason.
+//! A worker is this program with `--worker`: it reads the number of a point from standard input, computes the run,
+//! caches it, and answers on standard output: `frame` for each frame, then `done`, or `failed` with the reason.
 
 use std::io::{BufRead, BufReader, Write};
 use std::path::Path;
@@ -10,14 +10,14 @@ use std::sync::Mutex;
 
 use super::SweepError;
 
-/// What a worker says of a run.
+/// Answer of a worker: a frame is computed.
 pub(super) const FRAME: &str = "frame";
-/// The run is kept.
+/// The run is cached.
 pub(super) const DONE: &str = "done";
-/// The run came to nothing; the reason follows on the same line.
+/// The run failed; the reason follows on the same line.
 pub(super) const FAILED: &str = "failed";
 
-/// Has the points of these numbers computed by `jobs` processes; `on_frame` and `on_done` are told as things happen.
+/// Computes the points of these numbers with `jobs` processes; calls `on_frame` and `on_done` for each frame and run.
 pub(super) fn run(
     file: &Path,
     out: &Path,
@@ -40,7 +40,7 @@ pub(super) fn run(
     failure.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner).map_or(Ok(()), Err)
 }
 
-/// Feeds one worker until nothing is left, or another one has failed.
+/// Feeds one worker until no run is left, or another worker has failed.
 fn serve(
     file: &Path,
     out: &Path,
@@ -50,7 +50,7 @@ fn serve(
     on_done: &dyn Fn(),
 ) -> Result<(), SweepError> {
     let mut worker = Worker(start(file, out)?);
-    let silent = || SweepError::Worker("it ended without a word".into());
+    let silent = || SweepError::Worker("it ended without an answer".into());
     let mut input = worker.0.stdin.take().ok_or_else(silent)?;
     let mut output = BufReader::new(worker.0.stdout.take().ok_or_else(silent)?).lines();
     loop {
@@ -67,7 +67,7 @@ fn serve(
                 (FRAME, _) => on_frame(),
                 (DONE, _) => break on_done(),
                 (FAILED, reason) => return Err(SweepError::Worker(reason.to_owned())),
-                _ => return Err(SweepError::Worker(format!("it says {line:?}"))),
+                _ => return Err(SweepError::Worker(format!("unexpected answer {line:?}"))),
             }
         }
     }
@@ -83,12 +83,12 @@ fn start(file: &Path, out: &Path) -> Result<Child, SweepError> {
         .map_err(|source| SweepError::Io { path: program, source })
 }
 
-/// A process that does not outlive its use.
+/// A process that is killed when it is dropped.
 struct Worker(Child);
 
 impl Drop for Worker {
     fn drop(&mut self) {
-        // It ends by itself when its input does; one that hangs must not stay.
+        // It ends by itself at the end of its input; one that hangs is killed.
         let _ = self.0.kill();
         let _ = self.0.wait();
     }

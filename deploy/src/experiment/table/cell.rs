@@ -1,4 +1,4 @@
-//! One number of a table, kept on disk under everything that decides it.
+//! One cell of a table, cached on disk by all its inputs.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -14,41 +14,41 @@ use sha2::{Digest, Sha256};
 use support::atomic_file;
 
 use super::TableError;
-use crate::experiment::fingerprint::hash_file;
-use crate::experiment::metrics::Metrics;
+use crate::scenario::fingerprint::hash_file;
+use crate::score::metrics::Metrics;
 
-/// Everything that decides a cell.
+/// All inputs of a cell, the key of the cache.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct CellKey {
-    /// The method.
+    /// Fusion method.
     pub method: Method,
     /// SHA-256 of its weights.
     pub weights_sha256: String,
     /// SHA-256 over the contents of the data ([`dataset::content_sha256`]).
     pub data_sha256: String,
-    /// Where poses come from.
+    /// Pose source.
     pub poses: PoseSourceConfig,
-    /// SHA-256 of each file that poses come from.
+    /// SHA-256 of each file of the pose source.
     pub poses_sha256: Vec<String>,
-    /// How long messages are under way, milliseconds.
+    /// Delay of messages, milliseconds.
     pub delay_ms: u64,
-    /// How exactly feature values cross the air.
+    /// Number format of transmitted feature values.
     pub dtype: protocol::Dtype,
-    /// Frames at most.
+    /// Largest number of frames.
     pub frames: Option<usize>,
-    /// Scenarios at most, evenly spread.
+    /// Largest number of scenarios, evenly spread.
     #[serde(default)]
     pub scenarios: Option<usize>,
-    /// Neighbours that lie.
+    /// Attack by neighbours.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub attack: Option<AttackConfig>,
-    /// When the ego leaves out neighbours that it does not trust.
+    /// Misbehaviour detection of the ego.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub trust: Option<MisbehaviourConfig>,
-    /// The protocol that was asked for.
+    /// Requested protocol.
     #[serde(default, skip_serializing_if = "is_default")]
     pub protocol: ProtocolConfig,
-    /// Boxes at or below this score are not judged.
+    /// Score at or below which boxes are ignored.
     pub score_threshold: f32,
     /// Version of the program.
     pub version: String,
@@ -58,21 +58,21 @@ fn is_default(protocol: &ProtocolConfig) -> bool {
     *protocol == ProtocolConfig::default()
 }
 
-/// A cell that is done.
+/// A completed cell.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Cell {
-    /// What decided it.
+    /// Its inputs.
     pub key: CellKey,
-    /// The weights' file, as it was called.
+    /// Path of the weights' file at that time.
     pub weights: PathBuf,
-    /// Commit of the program that computed it, where that is known.
+    /// Commit of the program that computed it, if known.
     pub commit: String,
-    /// The numbers.
+    /// Its metrics.
     pub metrics: Metrics,
 }
 
 impl CellKey {
-    /// The file that the cell is kept in.
+    /// Cache file of the cell.
     pub(super) fn file(&self, folder: &Path) -> PathBuf {
         let text = serde_json::to_string(self).unwrap_or_default();
         let digest = Sha256::digest(text.as_bytes());
@@ -82,10 +82,10 @@ impl CellKey {
 }
 
 impl Cell {
-    /// The cell as it was kept; nothing where it was not.
+    /// The cached cell; `None` if it does not exist.
     ///
     /// # Errors
-    /// [`TableError::Spec`] when the file says something else.
+    /// [`TableError::Spec`] when the file belongs to other inputs.
     pub(super) fn read(key: &CellKey, folder: &Path) -> Result<Option<Self>, TableError> {
         let path = key.file(folder);
         let Ok(text) = fs::read_to_string(&path) else { return Ok(None) };
@@ -94,7 +94,7 @@ impl Cell {
         Ok((cell.key == *key).then_some(cell))
     }
 
-    /// Keeps the cell; a file appears only when it is whole.
+    /// Caches the cell; the file appears only when it is complete.
     ///
     /// # Errors
     /// [`TableError::Io`] when it cannot be written.
@@ -105,7 +105,7 @@ impl Cell {
     }
 }
 
-/// SHA-256 of the files that poses come from.
+/// SHA-256 of the files of a pose source.
 ///
 /// # Errors
 /// [`TableError::Io`] names the file that cannot be read.

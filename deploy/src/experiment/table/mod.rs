@@ -1,7 +1,7 @@
 //! Tables of methods: rows of methods and weights, columns of poses and delays, a cell for each, in Markdown and CSV.
 //!
-//! Cells are kept one by one under all that decides them, so that an interrupted run goes on where it was and a changed
-//! row costs that row alone.
+//! Cells are cached one by one by all their inputs, so that an interrupted run resumes and a changed row costs only
+//! that row.
 
 mod cell;
 mod spec;
@@ -22,27 +22,27 @@ pub use spec::{Column, Row, Table, TableSpec};
 pub use text::{csv, markdown};
 
 use crate::experiment::evaluation::{EvaluationError, EvaluationOptions, Part, evaluate};
-use crate::experiment::weights_choice::WeightsChoiceError;
+use crate::scenario::weights_choice::WeightsChoiceError;
 use ego_fuser::misbehaviour::MisbehaviourConfig;
 use training::feature_store::KeptMaps;
 
-/// Why a table came to nothing.
+/// Reason why a table failed.
 #[derive(Debug, thiserror::Error)]
 pub enum TableError {
-    /// The system refused.
+    /// Error of the operating system.
     #[error("{}: {source}", path.display())]
     Io {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// What the system said.
+        /// Error of the operating system.
         source: io::Error,
     },
-    /// A file does not say what it should.
+    /// A file has invalid content.
     #[error("{}: {problem}", path.display())]
     Spec {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// What is wrong with it.
+        /// Description of the error.
         problem: String,
     },
     /// The file of tables cannot be read.
@@ -65,35 +65,35 @@ pub enum TableError {
 /// The cells of a row: for each column one per training.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FilledRow {
-    /// What stands before it.
+    /// First column of the row.
     pub label: String,
     /// Column by column, training by training.
     pub cells: Vec<Vec<Cell>>,
 }
 
-/// A table with all its numbers.
+/// A table with all its values.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FilledTable {
     /// Name of its files.
     pub name: String,
-    /// What stands above its columns.
+    /// Titles of its columns.
     pub columns: Vec<String>,
     /// Its rows.
     pub rows: Vec<FilledRow>,
 }
 
-/// Hears how far tables are.
+/// Observer of the progress of tables.
 pub trait TableObserver {
-    /// A cell is next; `known` where it was computed before.
+    /// A cell is next; `known` if it was computed before.
     fn cell(&mut self, table: &str, row: &str, column: &str, known: bool);
-    /// A frame is judged.
+    /// A frame has been evaluated.
     fn frame(&mut self);
 }
 
-/// Computes what is missing and writes every table into `out`: `NAME.md`, `NAME.csv`, and `cells/`.
+/// Computes the missing cells and writes every table into `out`: `NAME.md`, `NAME.csv`, and `cells/`.
 ///
 /// # Errors
-/// [`TableError`] at the first cell that cannot be computed; those before it are kept.
+/// [`TableError`] at the first cell that cannot be computed; earlier cells are cached.
 pub fn run(spec: &TableSpec, out: &Path, observer: &mut dyn TableObserver) -> Result<Vec<FilledTable>, TableError> {
     let cells = out.join("cells");
     fs::create_dir_all(&cells).map_err(|source| TableError::Io { path: cells.clone(), source })?;
@@ -193,9 +193,9 @@ impl Run<'_> {
     }
 }
 
-/// The commit that lies checked out where the program runs, `-dirty` where files differ from it.
+/// Commit of the checkout in the working directory, with `-dirty` if files differ from it.
 fn commit() -> String {
     let output = Command::new("git").args(["describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]).output();
-    let said = output.ok().filter(|output| output.status.success());
-    said.map_or_else(|| "unknown".to_owned(), |output| String::from_utf8_lossy(&output.stdout).trim().to_owned())
+    let description = output.ok().filter(|output| output.status.success());
+    description.map_or_else(|| "unknown".to_owned(), |output| String::from_utf8_lossy(&output.stdout).trim().to_owned())
 }

@@ -1,4 +1,4 @@
-//! What tables are asked for.
+//! `--table FILE`: tables of methods and conditions.
 
 use std::path::{Path, PathBuf};
 
@@ -12,30 +12,30 @@ use schemars::JsonSchema;
 use serde::Deserialize;
 
 use super::TableError;
-use crate::experiment::weights_choice::weights_of;
+use crate::scenario::weights_choice::weights_of;
 
-/// A file of tables: what is common to all, and each.
+/// A file of tables: common settings, and each table.
 #[derive(Debug, Clone, PartialEq, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct TableSpec {
     /// Data set, split or scenario; the first vehicle of each scenario is the ego.
     pub dataset: PathBuf,
-    /// Whose messages and annotations count, and which objects.
+    /// Participating vehicles, counted annotations and objects.
     #[serde(default)]
     pub protocol: ProtocolConfig,
     /// Folder with a file `*-METHOD.safetensors` for each method, for rows that name no weights.
     #[serde(default)]
     pub weights: Option<PathBuf>,
-    /// How exactly feature values cross the air.
+    /// Number format of transmitted feature values.
     #[serde(default = "half")]
     pub dtype: Dtype,
-    /// Frames to judge at most, over all scenarios.
+    /// Largest number of frames to evaluate, over all scenarios.
     #[serde(default)]
     pub frames: Option<usize>,
-    /// Where maps of encoders are kept; absent: they are computed for every cell.
+    /// Folder of cached feature maps; absent: they are computed for every cell.
     #[serde(default)]
     pub maps: Option<PathBuf>,
-    /// Most gigabytes of maps per encoder.
+    /// Largest cache of feature maps per encoder, gigabytes.
     #[serde(default = "gigabytes")]
     pub maps_limit_gb: f64,
     /// The tables.
@@ -48,7 +48,7 @@ pub struct TableSpec {
 pub struct Table {
     /// Name of its files.
     pub name: String,
-    /// Scenarios to judge at most, evenly spread over the data set; absent: all.
+    /// Largest number of scenarios to evaluate, evenly spread over the data set; absent: all.
     #[serde(default)]
     pub scenarios: Option<usize>,
     /// Its rows.
@@ -61,35 +61,35 @@ pub struct Table {
 #[derive(Debug, Clone, PartialEq, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Row {
-    /// What stands before it; absent: the method.
+    /// First column of the row; absent: the method.
     #[serde(default)]
     pub name: Option<String>,
-    /// The method.
+    /// Fusion method.
     pub method: Method,
     /// Its weights, several for a mean over trainings; absent: those of the folder.
     #[serde(default)]
     pub weights: Vec<PathBuf>,
-    /// Poses of this row, whatever the columns say.
+    /// Pose source of this row, in place of that of the columns.
     #[serde(default)]
     pub poses: Option<PoseSourceConfig>,
 }
 
-/// What rows are judged under.
+/// Conditions of a column.
 #[derive(Debug, Clone, PartialEq, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Column {
-    /// What stands above it.
+    /// Title of the column.
     pub name: String,
-    /// Where poses come from.
+    /// Pose source.
     #[serde(default)]
     pub poses: PoseSourceConfig,
-    /// How long messages of neighbours are under way, milliseconds.
+    /// Delay of the messages of neighbours, milliseconds.
     #[serde(default)]
     pub delay_ms: u64,
-    /// Neighbours that lie; absent: none.
+    /// Attack by neighbours; absent: none.
     #[serde(default)]
     pub attack: Option<AttackConfig>,
-    /// Whether the ego leaves out neighbours that it does not trust.
+    /// Misbehaviour detection of the ego.
     #[serde(default)]
     pub trust: bool,
 }
@@ -106,7 +106,7 @@ impl TableSpec {
     /// Reads a file of tables.
     ///
     /// # Errors
-    /// [`TableError`] names the file and what is wrong with it.
+    /// [`TableError`] names the file and the error.
     pub fn read(path: &Path) -> Result<Self, TableError> {
         let spec: Self = config_file::read(path)?;
         spec.check().map_err(|problem| TableError::Spec { path: path.to_owned(), problem })?;
@@ -132,7 +132,7 @@ impl TableSpec {
     /// The weights of a row, one file per training.
     ///
     /// # Errors
-    /// [`TableError`] where neither the row nor the folder has any.
+    /// [`TableError`] when neither the row nor the folder has any.
     pub fn weights_of(&self, row: &Row) -> Result<Vec<PathBuf>, TableError> {
         match (&row.weights[..], &self.weights) {
             ([], Some(folder)) => Ok(vec![weights_of(folder, row.method)?]),
@@ -141,7 +141,7 @@ impl TableSpec {
         }
     }
 
-    /// How maps are written.
+    /// Encoding of feature maps.
     #[must_use]
     pub fn codec(&self) -> CodecConfig {
         CodecConfig { dtype: self.dtype, ..CodecConfig::default() }
@@ -149,7 +149,7 @@ impl TableSpec {
 }
 
 impl Row {
-    /// What stands before it.
+    /// First column of the row.
     #[must_use]
     pub fn label(&self) -> String {
         self.name.clone().unwrap_or_else(|| self.method.name().to_owned())

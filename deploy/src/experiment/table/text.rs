@@ -1,4 +1,4 @@
-//! Tables as Markdown, for people, and as CSV, for programs.
+//! Tables as Markdown and as CSV.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -6,10 +6,10 @@ use std::fmt::Write as _;
 use support::csv_file::CsvText;
 
 use super::{Cell, FilledRow, FilledTable};
-use crate::experiment::metrics::ByIou;
+use crate::score::metrics::ByIou;
 
-/// A table for people: AP@0.3/0.5/0.7 in per cent. One column of conditions is spread out into both orderings and bytes;
-/// several have the global ordering alone. Below it stands what it was made of.
+/// Markdown table: AP@0.3/0.5/0.7 in per cent. A single column of conditions is expanded into both orderings and bytes;
+/// several show the global ordering only. The provenance follows below.
 #[must_use]
 pub fn markdown(table: &FilledTable) -> String {
     let mut text = format!("# {}\n\n", table.name);
@@ -45,7 +45,7 @@ pub fn markdown(table: &FilledTable) -> String {
     text + &provenance(table)
 }
 
-/// What the numbers were made of: frames, commits, data and weights.
+/// Provenance of the values: frames, commits, data and weights.
 fn provenance(table: &FilledTable) -> String {
     let cells = || table.rows.iter().flat_map(|row| row.cells.iter().flatten());
     let all = |value: &dyn Fn(&Cell) -> String| {
@@ -68,7 +68,7 @@ fn provenance(table: &FilledTable) -> String {
     text
 }
 
-/// A line per cell and training.
+/// CSV: a line per cell and training.
 #[must_use]
 pub fn csv(table: &FilledTable) -> String {
     let mut text = CsvText::new(
@@ -139,9 +139,7 @@ mod tests {
 
     use super::super::CellKey;
     use super::*;
-    use crate::experiment::metrics::{
-        Communication, Contribution, Latencies, Messages, Metrics, Percentiles, PoseErrors,
-    };
+    use crate::score::metrics::{Communication, Contribution, Latencies, Messages, Metrics, Percentiles, PoseErrors};
 
     fn cell(method: Method, at_50: f64) -> Cell {
         let ap = ByIou { at_30: Some(0.9), at_50: Some(at_50), at_70: None };

@@ -1,4 +1,4 @@
-//! Why a scenario makes no fleet.
+//! Errors of scenarios from which no fleet can be built.
 
 use std::path::PathBuf;
 
@@ -8,9 +8,9 @@ use localization::pgc::LocalizerError;
 use perception::weights::WeightsError;
 use protocol::CavId;
 
-use crate::experiment::weights_choice::WeightsChoiceError;
+use crate::scenario::weights_choice::WeightsChoiceError;
 
-/// Why a scenario makes no fleet.
+/// Reason why no fleet can be built from a scenario.
 #[derive(Debug, thiserror::Error)]
 pub enum FleetError {
     /// The scene cannot be read.
@@ -25,43 +25,43 @@ pub enum FleetError {
     /// The data set has no scenario of that name.
     #[error("scene {}: there is no scenario {asked:?}; it has {found:?}", dir.display())]
     NoScenario {
-        /// The data set.
+        /// Folder of the data set.
         dir: PathBuf,
-        /// The name asked for.
+        /// Requested name.
         asked: String,
-        /// The names there are.
+        /// Names in the data set.
         found: Vec<String>,
     },
-    /// The scenario has no moment that all its vehicles have.
+    /// The scenario has no capture time that all its vehicles have.
     #[error("scene {}: scenario {name} has no frame that all of {agents:?} have", dir.display())]
     NoFrames {
-        /// The data set.
+        /// Folder of the data set.
         dir: PathBuf,
-        /// The scenario.
+        /// Name of the scenario.
         name: String,
-        /// Its vehicles.
+        /// Ids of its vehicles.
         agents: Vec<String>,
     },
     /// The first tick to play is behind the last.
     #[error("scene.seek is {seek}, but scenario {name} has {ticks} ticks")]
     Seek {
-        /// The tick asked for.
+        /// Requested tick, from 0.
         seek: usize,
-        /// The scenario.
+        /// Name of the scenario.
         name: String,
-        /// Its ticks.
+        /// Number of its ticks.
         ticks: usize,
     },
     /// A vehicle is named that the scene does not have.
     #[error("{field} names vehicle {cav}, but scenario {name} has {found:?}")]
     NoVehicle {
-        /// Where it is named.
+        /// Field with the id.
         field: &'static str,
-        /// The vehicle.
+        /// Id of the vehicle.
         cav: CavId,
-        /// The scenario.
+        /// Name of the scenario.
         name: String,
-        /// The vehicles there are.
+        /// Ids of the vehicles in the scene.
         found: Vec<String>,
     },
     /// A vehicle is to take its pose from a recording that has none.
@@ -70,11 +70,11 @@ pub enum FleetError {
          which finds them"
     )]
     NoPoses {
-        /// The vehicle.
+        /// Id of the vehicle.
         cav: CavId,
-        /// Where its pose was to come from.
+        /// Name of its pose source.
         source_name: &'static str,
-        /// The scenario.
+        /// Name of the scenario.
         name: String,
     },
     /// The weights cannot be used.
@@ -83,10 +83,10 @@ pub enum FleetError {
     /// There are no weights for the method.
     #[error(transparent)]
     NoWeights(#[from] WeightsChoiceError),
-    /// The emulated air cannot be made.
+    /// The link emulation cannot be built.
     #[error(transparent)]
     Link(#[from] LinkError),
-    /// The networks that find poses cannot be used, or not together.
+    /// The pose networks cannot be used, or not together.
     #[error("localizer: {0}")]
     Localizer(#[from] LocalizerError),
 }

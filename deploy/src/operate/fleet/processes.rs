@@ -18,14 +18,14 @@ use crate::operate::security::RunKeys;
 use crate::operate::supervise::{ProcessSpec, RestartPolicy};
 use crate::scenario::Clock;
 
-/// Where the processes of a run meet, where their programs lie, and where they write.
+/// Session context of the processes: run, router endpoint, program folder and run folder.
 #[derive(Debug, Clone, Copy)]
 pub struct SessionContext<'a> {
     /// The run that they join.
     pub run: &'a RunId,
-    /// Of the router.
+    /// Endpoint of the router.
     pub endpoint: &'a Endpoint,
-    /// Where the processes find their keys, where they have some.
+    /// Keys of the processes, if the run has security.
     pub keys: Option<&'a RunKeys>,
     /// Folder of the programs.
     pub programs: &'a Path,
@@ -34,27 +34,27 @@ pub struct SessionContext<'a> {
 }
 
 impl Fleet {
-    /// Every process to start, the recorder last where the scenario asks for one. Writes their configurations.
+    /// Every process to start, the recorder last if the scenario asks for one. Writes their configurations.
     ///
     /// # Errors
     /// [`RunFolderError::Write`] when the run folder cannot be written.
-    pub fn processes(&self, meeting: &SessionContext<'_>) -> Result<Vec<ProcessSpec>, RunFolderError> {
-        let mut planner = self.planner(meeting);
+    pub fn processes(&self, context: &SessionContext<'_>) -> Result<Vec<ProcessSpec>, RunFolderError> {
+        let mut planner = self.planner(context);
         self.plan_agents(&mut planner)?;
         planner.plan(format!("ego-{}", self.ego), "ego-fuser run", RestartPolicy::Service, |bus| {
-            self.ego_config(meeting, bus)
+            self.ego_config(context, bus)
         })?;
         if self.is_over_link() {
             planner.plan(format!("link-{}", self.ego), "sim-replay link", RestartPolicy::Service, |bus| {
-                self.link_config(meeting, bus)
+                self.link_config(context, bus)
             })?;
         }
         planner
-            .plan(REPLAY.into(), "sim-replay stream", RestartPolicy::Task, |bus| self.replay_config(meeting, bus))?;
+            .plan(REPLAY.into(), "sim-replay stream", RestartPolicy::Task, |bus| self.replay_config(context, bus))?;
         if let Some(record) = &self.scenario.record {
-            let (run, out) = (meeting.run.clone(), meeting.folder.file(RECORDING));
+            let (run, out) = (context.run.clone(), context.folder.file(RECORDING));
             let config = |bus| RecorderConfig { run, out, record: record.clone(), keep_running: false, bus };
-            // A recording cannot be resumed in the middle.
+            // A recording cannot be resumed after an interruption.
             planner.plan(RECORDER.into(), "sim-replay record --json", RestartPolicy::Optional, config)?;
         }
         Ok(planner.specs)
@@ -64,39 +64,39 @@ impl Fleet {
     ///
     /// # Errors
     /// [`RunFolderError::Write`] when the run folder cannot be written.
-    pub fn agent_processes(&self, meeting: &SessionContext<'_>) -> Result<Vec<ProcessSpec>, RunFolderError> {
-        let mut planner = self.planner(meeting);
+    pub fn agent_processes(&self, context: &SessionContext<'_>) -> Result<Vec<ProcessSpec>, RunFolderError> {
+        let mut planner = self.planner(context);
         self.plan_agents(&mut planner)?;
         Ok(planner.specs)
     }
 
-    fn planner<'a>(&self, meeting: &'a SessionContext<'a>) -> Planner<'a> {
+    fn planner<'a>(&self, context: &'a SessionContext<'a>) -> Planner<'a> {
         let bus = BusConfig {
-            connect: meeting.endpoint.clone(),
+            connect: context.endpoint.clone(),
             shared_memory_mib: self.scenario.network.shared_memory_mib,
             supervised: true,
             ..BusConfig::default()
         };
-        Planner { meeting, bus, metrics: self.scenario.network.metrics, specs: Vec::new() }
+        Planner { context, bus, metrics: self.scenario.network.metrics, specs: Vec::new() }
     }
 
     fn plan_agents(&self, planner: &mut Planner<'_>) -> Result<(), RunFolderError> {
         for cav in self.agents.iter().filter(|cav| !self.scenario.remote_agents.contains(cav)) {
-            let meeting = planner.meeting;
+            let context = planner.context;
             planner.plan(format!("agent-{cav}"), "agent run", RestartPolicy::Service, |bus| {
-                self.agent_config(cav, meeting, bus)
+                self.agent_config(cav, context, bus)
             })?;
         }
         Ok(())
     }
 
-    fn agent_config(&self, cav: &CavId, meeting: &SessionContext<'_>, bus: BusConfig) -> AgentConfig {
+    fn agent_config(&self, cav: &CavId, context: &SessionContext<'_>, bus: BusConfig) -> AgentConfig {
         let mut settings = self.scenario.settings_of(cav);
         let scene = self.scenario.scene.scenario.as_deref().unwrap_or_default();
         settings.pose = settings.pose.for_scenario(scene);
         let is_ego = *cav == self.ego;
         if is_ego {
-            // It sends to its own ego, not over the link, and the ego is to have all of its map.
+            // It sends to its own ego, not over the link, and the ego needs its complete feature map.
             settings.codec = CodecConfig { gate: None, budget_bytes: None, ..settings.codec };
             settings.rate = RateConfig::default();
         } else {
@@ -104,20 +104,20 @@ impl Fleet {
         }
         let notes_sweeps = is_ego && self.scenario.clock == Clock::Wall;
         AgentConfig {
-            run: meeting.run.clone(),
+            run: context.run.clone(),
             cav: cav.clone(),
             models: self.scenario.models.clone(),
             settings,
             publish: vec![self.publish()],
             keep_running: false,
-            sweep_log: notes_sweeps.then(|| meeting.folder.file(SWEEP_LOG)),
+            sweep_log: notes_sweeps.then(|| context.folder.file(SWEEP_LOG)),
             bus,
         }
     }
 
-    fn ego_config(&self, meeting: &SessionContext<'_>, bus: BusConfig) -> EgoConfig {
+    fn ego_config(&self, context: &SessionContext<'_>, bus: BusConfig) -> EgoConfig {
         EgoConfig {
-            run: meeting.run.clone(),
+            run: context.run.clone(),
             models: self.scenario.models.clone(),
             method: Some(self.scenario.method),
             ego: self.scenario.ego.clone(),
@@ -129,9 +129,9 @@ impl Fleet {
         }
     }
 
-    fn link_config(&self, meeting: &SessionContext<'_>, bus: BusConfig) -> LinkProcessConfig {
+    fn link_config(&self, context: &SessionContext<'_>, bus: BusConfig) -> LinkProcessConfig {
         LinkProcessConfig {
-            run: meeting.run.clone(),
+            run: context.run.clone(),
             ego: self.ego.clone(),
             link: self.scenario.link.clone().unwrap_or_default(),
             streams: vec![Stream::Pose, self.publish().stream(), Stream::Descriptor],
@@ -141,10 +141,10 @@ impl Fleet {
         }
     }
 
-    fn replay_config(&self, meeting: &SessionContext<'_>, bus: BusConfig) -> ReplayConfig {
+    fn replay_config(&self, context: &SessionContext<'_>, bus: BusConfig) -> ReplayConfig {
         let scene = &self.scenario.scene;
         ReplayConfig {
-            run: meeting.run.clone(),
+            run: context.run.clone(),
             scene: scene.clone(),
             wait: WaitConfig {
                 expect: self.recorded(self.routes()),
@@ -153,22 +153,22 @@ impl Fleet {
                 ..WaitConfig::default()
             },
             sensor_link: SensorLinkConfig::default(),
-            bookmark: Some(meeting.folder.file(BOOKMARK)),
+            bookmark: Some(context.folder.file(BOOKMARK)),
             bus,
         }
     }
 
-    /// Whether the scenario emulates a link and the method sends anything through it.
+    /// True if the scenario emulates a link and the method sends anything through it.
     pub(super) fn is_over_link(&self) -> bool {
         self.scenario.link.is_some() && self.scenario.method.exchange() != Exchange::Nothing
     }
 }
 
-/// Processes so far, and what the next one has in common with them.
+/// Processes planned so far, and the settings that the next one shares with them.
 struct Planner<'a> {
-    meeting: &'a SessionContext<'a>,
+    context: &'a SessionContext<'a>,
     bus: BusConfig,
-    /// Address of the process before; the next one takes the port behind it.
+    /// Metrics address of the previous process; the next one takes the port after it.
     metrics: Option<SocketAddr>,
     specs: Vec<ProcessSpec>,
 }
@@ -182,14 +182,14 @@ impl Planner<'_> {
         life: RestartPolicy,
         config: impl FnOnce(BusConfig) -> C,
     ) -> Result<(), RunFolderError> {
-        let SessionContext { keys, programs, folder, .. } = self.meeting;
+        let SessionContext { keys, programs, folder, .. } = self.context;
         self.metrics = self.metrics.and_then(port_behind);
         let keys = keys.map(|keys| keys.of_process(&name));
         let bus = BusConfig { keys, metrics: self.metrics, ..self.bus.clone() };
         let file = folder.write_config(&name, &config(bus))?;
-        let mut words = command.split(' ');
-        let program = programs.join(words.next().unwrap_or_default());
-        let mut args: Vec<_> = words.map(Into::into).collect();
+        let mut parts = command.split(' ');
+        let program = programs.join(parts.next().unwrap_or_default());
+        let mut args: Vec<_> = parts.map(Into::into).collect();
         args.extend(["--config".into(), file.into()]);
         self.specs.push(ProcessSpec { name, program, args, life, metrics: self.metrics });
         Ok(())

@@ -1,4 +1,4 @@
-//! Who has to hear whom before the clock of a scene starts.
+//! Subscriptions that must be in place before the clock of a scene starts.
 
 use std::collections::BTreeSet;
 
@@ -7,10 +7,10 @@ use fusion::Exchange;
 use protocol::{CavId, ProcessId, Role, Stream, Topic};
 
 use super::{Fleet, RECORDER};
-use crate::experiment::score::scorer_cav;
+use crate::score::scorer_cav;
 
 impl Fleet {
-    /// What has to stand before the clock starts, beside the routes from the replay to the agents that it knows itself.
+    /// Routes that must exist before the clock starts, in addition to those from the replay to the agents.
     pub(super) fn routes(&self) -> Vec<Route> {
         let ego = process_id(Role::Ego, &self.ego);
         let scorer = process_id(Role::Scorer, &scorer_cav());
@@ -27,7 +27,7 @@ impl Fleet {
         }
         let stream = self.publish().stream();
         routes.push(route(&self.ego, stream, &ego));
-        // Alone, the ego listens to nobody but its own agent.
+        // Ego-only: the ego subscribes to its own agent and to no other.
         if self.scenario.method.exchange() == Exchange::Nothing {
             return routes;
         }
@@ -43,8 +43,8 @@ impl Fleet {
         routes
     }
 
-    /// The routes, and where the run is recorded those of the same topics and of the sensors to the recorder: what is
-    /// published before it listens is lost to it.
+    /// The routes, and, if the run is recorded, those of the same topics and of the sensors to the recorder: messages
+    /// published before it subscribes are not recorded.
     pub(super) fn recorded(&self, mut routes: Vec<Route>) -> Vec<Route> {
         if self.scenario.record.is_some() {
             let receiver = process_id(Role::Recorder, &recorder_cav());
@@ -59,7 +59,7 @@ impl Fleet {
     }
 }
 
-/// The recorder's name in place of a vehicle's.
+/// Id of the recorder in place of a vehicle's.
 fn recorder_cav() -> CavId {
     CavId::new(RECORDER).expect("eight lower-case letters")
 }

@@ -1,7 +1,7 @@
-//! Keeps the processes of a run alive: starts them, logs them, starts the fallen again, ends them all in time.
+//! Process supervision: starts, logs, restarts and ends the processes of a run.
 //!
-//! Every process reads its standard input as a lifeline: the supervisor holds the other end and never writes, so that
-//! the death of the supervisor, however sudden, ends the fleet.
+//! The standard input of every process is a parent-death pipe: the supervisor holds the other end and never writes, so
+//! that any end of the supervisor ends the fleet.
 
 mod said;
 #[cfg(test)]
@@ -25,59 +25,59 @@ use watcher::{Log, Watcher};
 pub struct ProcessSpec {
     /// Name in messages and of its log.
     pub name: String,
-    /// The executable.
+    /// Path of the executable.
     pub program: PathBuf,
     /// Its arguments.
     pub args: Vec<OsString>,
-    /// What its end means.
+    /// Restart policy.
     pub life: RestartPolicy,
-    /// Where it serves its counters to Prometheus, if it does.
+    /// Address of its Prometheus endpoint, if it has one.
     pub metrics: Option<SocketAddr>,
 }
 
-/// What the end of a process means.
+/// Restart policy of a process.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum RestartPolicy {
-    /// It works until the run is over; when it ends before, it is started again.
+    /// Works until the run is over; restarted when it ends before.
     Service,
-    /// It has one job. When something ends it before that is done it is started again and takes it up where it was; when it
-    /// says itself that it cannot do it, it stays down.
+    /// Has one task. When something ends it before the task is done, it is restarted and resumes; when it reports
+    /// itself that the task is impossible, it stays down.
     Task,
-    /// It has one job, which cannot be taken up in the middle; when it fails, it stays down, and the run goes on without it.
+    /// Has one task, which cannot be resumed; when it fails, it stays down, and the run goes on without it.
     Optional,
 }
 
-/// What happened to a process.
+/// Event of a process.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ProcessEvent {
     /// Name of the process.
     pub name: String,
-    /// What happened.
+    /// Kind of the event.
     pub what: ProcessEventKind,
 }
 
-/// What happened to a process.
+/// Kind of an event.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum ProcessEventKind {
-    /// It runs.
+    /// The process runs.
     Started {
         /// Its process id.
         pid: u32,
     },
-    /// It fell and will be started again after a pause.
+    /// It crashed and will be restarted after a pause.
     Fell {
-        /// How it ended, in words.
+        /// Description of its end.
         how: String,
-        /// The pause.
+        /// Length of the pause.
         again_after: Duration,
-        /// Which restart of this process comes, counted from 1.
+        /// Number of this restart, from 1.
         restart: u32,
     },
-    /// It fell and stays down.
+    /// It crashed and stays down.
     GaveUp {
-        /// How it ended, in words, with the last line of its log.
+        /// Description of its end, with the last line of its log.
         how: String,
-        /// Whether the run can go on without it.
+        /// True if the run can go on without it.
         is_optional: bool,
     },
     /// It printed a line of its report.
@@ -85,22 +85,22 @@ pub enum ProcessEventKind {
         /// The line.
         line: String,
     },
-    /// It was asked to end, and ended in another way than it should.
+    /// It was asked to end, and ended in another way than expected.
     Failed {
-        /// How it ended, in words.
+        /// Description of its end.
         how: String,
     },
-    /// It ended as it should, by itself or as it was asked to.
+    /// It ended as expected, by itself or on request.
     Done {
-        /// It says that data were lost.
+        /// True if it reports lost data.
         data_lost: bool,
     },
 }
 
-/// Why a process could not be started at all.
+/// Reason why a process could not be started.
 #[derive(Debug, thiserror::Error)]
 pub enum SuperviseError {
-    /// The executable is not there.
+    /// The executable does not exist.
     #[error("{} is missing: build it (cargo build --release), it belongs beside v2vloc", .0.display())]
     NoProgram(PathBuf),
     /// The log cannot be written.
@@ -108,28 +108,28 @@ pub enum SuperviseError {
     Log {
         /// The log file.
         path: PathBuf,
-        /// Why.
+        /// Error of the operating system.
         source: std::io::Error,
     },
-    /// The runtime that watches the processes cannot be started.
+    /// The runtime of the supervisor cannot be started.
     #[error("cannot start the supervisor: {0}")]
     Runtime(std::io::Error),
 }
 
-/// How the end of a fleet went.
+/// Result of ending a fleet.
 #[derive(Debug, Default, Clone, PartialEq, Eq)]
 pub struct StopReport {
     /// Processes that did not end in time and were killed.
     pub killed: Vec<String>,
 }
 
-/// The processes of a run. Dropping it kills those that are left.
+/// Processes of a run. Dropping it kills those that still run.
 pub struct Supervisor {
     runtime: Runtime,
     watched: Vec<Watched>,
 }
 
-/// One process, as the supervisor holds it.
+/// State of one supervised process.
 struct Watched {
     name: String,
     stop: watch::Sender<Option<Instant>>,
@@ -138,9 +138,9 @@ struct Watched {
 }
 
 impl Supervisor {
-    /// Starts `specs` and watches over them; what happens is told to `events`.
+    /// Starts `specs` and supervises them; sends their events to `events`.
     ///
-    /// Standard output and error of each go to `<log_dir>/<name>.log`. A service that falls is started again after a
+    /// Standard output and error of each go to `<log_dir>/<name>.log`. A service that crashes is restarted after a
     /// pause, at most `restarts` times without a recovery in between.
     ///
     /// # Errors
@@ -168,16 +168,16 @@ impl Supervisor {
             .into_iter()
             .zip(logs)
             .map(|(spec, log)| {
-                let (name, (stop, told_to_stop)) = (spec.name.clone(), watch::channel(None));
-                let (replace, told_to_replace) = mpsc::channel(1);
+                let (name, (stop, stop_request)) = (spec.name.clone(), watch::channel(None));
+                let (replace, replace_request) = mpsc::channel(1);
                 let watcher = Watcher {
                     spec,
                     log,
                     restarts,
                     events: events.clone(),
-                    stop: told_to_stop,
-                    replace: told_to_replace,
-                    falls: 0,
+                    stop: stop_request,
+                    replace: replace_request,
+                    crashes: 0,
                     restarted: 0,
                 };
                 Watched { name, stop, replace, task: runtime.spawn(watcher.run()) }
@@ -186,14 +186,13 @@ impl Supervisor {
         Ok(Self { runtime, watched })
     }
 
-    /// Whether every process has ended for good.
+    /// True if every process has ended for good.
     #[must_use]
     pub fn all_ended(&self) -> bool {
         self.watched.iter().all(|watched| watched.task.is_finished())
     }
 
-    /// Kills a process that runs but does not work; what follows is what follows any other fall. `why` says in words what is
-    /// wrong with it.
+    /// Kills a hung process; then the rules of a crash apply. `why` describes the problem.
     pub fn replace(&self, name: &str, why: &str) {
         if let Some(watched) = self.watched.iter().find(|watched| watched.name == name) {
             // Full: it is being replaced already.
@@ -201,8 +200,8 @@ impl Supervisor {
         }
     }
 
-    /// Ends the processes that `which` chooses by name: asks them with SIGTERM, kills what is left at `deadline`.
-    /// Returns when they are gone.
+    /// Ends the processes that `which` selects by name: SIGTERM, then SIGKILL at `deadline`. Returns when they have
+    /// ended.
     pub fn end(&mut self, which: impl Fn(&str) -> bool, deadline: Instant) -> StopReport {
         let (chosen, others) = self.watched.drain(..).partition(|watched| which(&watched.name));
         self.watched = others;

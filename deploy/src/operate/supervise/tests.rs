@@ -1,4 +1,4 @@
-//! A supervisor over shells.
+//! Tests of the supervisor with shells as processes.
 
 use std::sync::mpsc::{Receiver, channel};
 
@@ -39,7 +39,7 @@ fn a_killed_service_is_started_again() {
     let (supervisor, events, _folder) = start(shell("car", RestartPolicy::Service, "exec sleep 600"), 3);
     let ProcessEventKind::Started { pid: first } = next(&events) else { panic!("not started") };
     kill_process(Pid::from_raw(first as i32).unwrap(), Signal::KILL).unwrap();
-    let ProcessEventKind::Fell { how, again_after, restart } = next(&events) else { panic!("not fallen") };
+    let ProcessEventKind::Fell { how, again_after, restart } = next(&events) else { panic!("not crashed") };
     assert_eq!((how.as_str(), again_after, restart), ("was ended by signal 9", FIRST_PAUSE, 1));
     let ProcessEventKind::Started { pid: second } = next(&events) else { panic!("not restarted") };
     assert_ne!(first, second);
@@ -48,7 +48,7 @@ fn a_killed_service_is_started_again() {
 }
 
 #[test]
-fn how_it_ends_when_it_is_asked_to_is_told_with_its_last_words() {
+fn a_requested_end_is_reported_with_the_last_line() {
     let waits = |code| format!("trap 'echo 7 missing; exit {code}' TERM; echo up; while :; do sleep 0.05; done");
     for (code, ended) in [
         (0, ProcessEventKind::Done { data_lost: false }),
@@ -65,7 +65,7 @@ fn how_it_ends_when_it_is_asked_to_is_told_with_its_last_words() {
 }
 
 #[test]
-fn a_service_that_keeps_falling_is_given_up_with_its_last_words() {
+fn a_service_that_keeps_crashing_is_given_up_with_its_last_line() {
     let (_supervisor, events, _folder) = start(shell("car", RestartPolicy::Service, "echo no engine >&2; exit 1"), 1);
     let happenings: Vec<_> = (0..4).map(|_| next(&events)).collect();
     assert!(matches!(&happenings[1], ProcessEventKind::Fell { again_after, .. } if *again_after == FIRST_PAUSE));
@@ -76,7 +76,7 @@ fn a_service_that_keeps_falling_is_given_up_with_its_last_words() {
 }
 
 #[test]
-fn the_lifeline_holds_as_long_as_the_supervisor() {
+fn the_parent_death_pipe_is_open_as_long_as_the_supervisor_runs() {
     let (supervisor, events, folder) = start(shell("car", RestartPolicy::Service, "echo up; cat; echo cut off"), 3);
     assert!(matches!(next(&events), ProcessEventKind::Started { .. }));
     let log = folder.path().join("car.log");
@@ -85,7 +85,7 @@ fn the_lifeline_holds_as_long_as_the_supervisor() {
         std::thread::yield_now();
     }
     assert_eq!(next(&events), ProcessEventKind::Said { line: "up".into() });
-    // Its input does not end, so neither does it.
+    // Its input does not end, so it does not end either.
     assert!(events.recv_timeout(Duration::from_millis(200)).is_err());
     drop(supervisor.stop(PATIENCE));
     assert_eq!(std::fs::read_to_string(&log).unwrap(), "up\n");
@@ -102,17 +102,17 @@ fn bad_input_is_not_tried_again() {
 }
 
 #[test]
-fn who_ignores_the_request_is_killed_at_the_deadline() {
+fn a_process_that_ignores_the_request_is_killed_at_the_deadline() {
     let (supervisor, events, folder) =
-        start(shell("deaf", RestartPolicy::Service, "trap '' TERM; echo up; while :; do sleep 0.05; done"), 3);
+        start(shell("stubborn", RestartPolicy::Service, "trap '' TERM; echo up; while :; do sleep 0.05; done"), 3);
     assert!(matches!(next(&events), ProcessEventKind::Started { .. }));
-    let log = folder.path().join("deaf.log");
+    let log = folder.path().join("stubborn.log");
     let began = Instant::now();
     while std::fs::read_to_string(&log).unwrap().is_empty() && began.elapsed() < PATIENCE {
         std::thread::yield_now();
     }
     let asked = Instant::now();
-    assert_eq!(supervisor.stop(Duration::from_millis(300)).killed, ["deaf"]);
+    assert_eq!(supervisor.stop(Duration::from_millis(300)).killed, ["stubborn"]);
     assert!(asked.elapsed() < Duration::from_secs(4), "{:?}", asked.elapsed());
 }
 
@@ -126,25 +126,25 @@ fn a_missing_program_is_named() {
 }
 
 #[test]
-fn who_hangs_is_killed_and_started_again_even_if_stopped() {
+fn a_hung_process_is_killed_and_restarted_even_if_stopped() {
     let (supervisor, events, _folder) = start(shell("car", RestartPolicy::Service, "exec sleep 600"), 3);
     let ProcessEventKind::Started { pid: first } = next(&events) else { panic!("not started") };
     kill_process(Pid::from_raw(first as i32).unwrap(), Signal::STOP).unwrap();
-    supervisor.replace("nobody", "is not here");
-    supervisor.replace("car", "has said nothing for 5 s");
-    let ProcessEventKind::Fell { how, .. } = next(&events) else { panic!("not fallen") };
-    assert_eq!(how, "has said nothing for 5 s");
+    supervisor.replace("unknown", "does not exist");
+    supervisor.replace("car", "has not reported for 5 s");
+    let ProcessEventKind::Fell { how, .. } = next(&events) else { panic!("not crashed") };
+    assert_eq!(how, "has not reported for 5 s");
     let ProcessEventKind::Started { pid: second } = next(&events) else { panic!("not restarted") };
     assert_ne!(first, second);
     kill_process(Pid::from_raw(second as i32).unwrap(), Signal::STOP).unwrap();
-    assert!(supervisor.stop(PATIENCE).killed.is_empty(), "who is stopped is woken to end");
+    assert!(supervisor.stop(PATIENCE).killed.is_empty(), "a stopped process is continued to end");
 }
 
 #[test]
 fn a_service_that_ends_well_but_too_early_is_started_again() {
     let (_supervisor, events, _folder) = start(shell("car", RestartPolicy::Service, "exit 0"), 1);
     assert!(matches!(next(&events), ProcessEventKind::Started { .. }));
-    assert!(matches!(next(&events), ProcessEventKind::Fell { how, .. } if how.contains("nobody here had asked")));
+    assert!(matches!(next(&events), ProcessEventKind::Fell { how, .. } if how.contains("without a request")));
 }
 
 #[test]

@@ -1,4 +1,4 @@
-//! One process through its lives.
+//! Watcher of one process: starts it, follows it and restarts it.
 
 use std::fs::{File, OpenOptions};
 use std::os::unix::process::ExitStatusExt;
@@ -14,22 +14,22 @@ use tokio::task::JoinHandle;
 
 use super::{ProcessEvent, ProcessEventKind, ProcessSpec, RestartPolicy, SuperviseError, said};
 
-/// Exit code of our programs for bad usage or input: starting again cannot help.
+/// Exit code of our programs for bad usage or input: a restart cannot help.
 const BAD_INPUT: i32 = 2;
-/// Exit code of our programs when all was done but data were lost.
+/// Exit code of our programs for complete work with lost data.
 const DATA_LOST: i32 = 3;
 /// Exit code of a Rust program that panics.
 const PANIC: i32 = 101;
-/// A process that has lived this long has recovered; its next fall is a first one again.
+/// Run time after which a process has recovered; its next crash counts as a first one.
 const RECOVERED: Duration = Duration::from_secs(10);
 /// First pause before a restart; it doubles up to [`LONGEST_PAUSE`].
 pub(super) const FIRST_PAUSE: Duration = Duration::from_millis(200);
-/// How long the report of a process that has ended may still be on its way.
-const LAST_WORDS: Duration = Duration::from_secs(1);
+/// Longest wait for the rest of the report of a process that has ended.
+const REPORT_TIMEOUT: Duration = Duration::from_secs(1);
 /// Longest pause before a restart.
 const LONGEST_PAUSE: Duration = Duration::from_secs(5);
 
-/// Where the output of a process goes.
+/// Log file of a process.
 #[derive(Debug)]
 pub(super) struct Log {
     path: PathBuf,
@@ -44,7 +44,7 @@ impl Log {
         }
     }
 
-    /// The last line that says something.
+    /// Last line that is not empty.
     fn last_line(&self) -> Option<String> {
         let bytes = std::fs::read(&self.path).ok()?;
         let tail = String::from_utf8_lossy(&bytes[bytes.len().saturating_sub(4096)..]).into_owned();
@@ -52,23 +52,23 @@ impl Log {
     }
 }
 
-/// Follows one process through its lives.
+/// Follows one process through its restarts.
 pub(super) struct Watcher {
     pub(super) spec: ProcessSpec,
     pub(super) log: Log,
     pub(super) restarts: u32,
     pub(super) events: Sender<ProcessEvent>,
     pub(super) stop: watch::Receiver<Option<Instant>>,
-    /// Why it is to be killed and started again.
+    /// Reasons for which it is to be killed and restarted.
     pub(super) replace: mpsc::Receiver<String>,
-    /// Falls without a recovery in between.
-    pub(super) falls: u32,
-    /// Times that it was started again.
+    /// Number of crashes without a recovery in between.
+    pub(super) crashes: u32,
+    /// Number of restarts.
     pub(super) restarted: u32,
 }
 
 impl Watcher {
-    /// RunScope until told to stop or the process stays down. Returns whether it had to be killed.
+    /// Runs until asked to stop or the process stays down. Returns true if it had to be killed.
     pub(super) async fn run(mut self) -> bool {
         loop {
             let born = Instant::now();
@@ -76,53 +76,53 @@ impl Watcher {
             let how = match self.spawn() {
                 Err(error) => format!("cannot be started: {error}"),
                 Ok(mut child) => {
-                    // Pop out, as waiting for a child closes the input that it still holds.
-                    let _lifeline = child.stdin.take();
-                    self.tell(ProcessEventKind::Started { pid: child.id().unwrap_or(0) });
+                    // Taken out, as waiting for a child closes the input that it still holds.
+                    let _parent_death_pipe = child.stdin.take();
+                    self.report(ProcessEventKind::Started { pid: child.id().unwrap_or(0) });
                     let report = self.follow(&mut child);
                     let stop = self.stop.clone();
-                    // A wish of an earlier life.
+                    // A request for the previous instance.
                     while self.replace.try_recv().is_ok() {}
                     tokio::select! {
                         Some(why) = self.replace.recv() => {
-                            // It cannot fail to end; an error means that it is gone already.
+                            // It cannot fail to end; an error means that the process has ended already.
                             let _ = child.kill().await;
                             why
                         },
-                        status = child.wait() => match heard_out(report, status).await {
+                        status = child.wait() => match read_out(report, status).await {
                             Ok(status) if is_done(status) && self.spec.life != RestartPolicy::Service => {
-                                self.tell(ProcessEventKind::Done { data_lost: !status.success() });
+                                self.report(ProcessEventKind::Done { data_lost: !status.success() });
                                 return false;
                             }
-                            Ok(status) if is_done(status) => "ended, though nobody here had asked it to".into(),
-                            Ok(status) if status.code() == Some(BAD_INPUT) => return self.give_up(&in_words(status)),
+                            Ok(status) if is_done(status) => "ended without a request".into(),
+                            Ok(status) if status.code() == Some(BAD_INPUT) => return self.give_up(&describe(status)),
                             Ok(status) => {
                                 can_go_on &= self.spec.life == RestartPolicy::Service || is_struck(status);
-                                in_words(status)
+                                describe(status)
                             }
                             Err(error) => error.to_string(),
                         },
-                        deadline = asked_to_stop(stop) => {
+                        deadline = stop_requested(stop) => {
                             let status = end(&mut child, deadline).await;
-                            let status = heard_out(report, status).await;
-                            return self.ended_as_asked(status);
+                            let status = read_out(report, status).await;
+                            return self.report_requested_end(status);
                         }
                     }
                 }
             };
             if born.elapsed() > RECOVERED {
-                self.falls = 0;
+                self.crashes = 0;
             }
-            self.falls += 1;
-            if !can_go_on || self.falls > self.restarts {
+            self.crashes += 1;
+            if !can_go_on || self.crashes > self.restarts {
                 return self.give_up(&how);
             }
-            let pause = LONGEST_PAUSE.min(FIRST_PAUSE * (1 << (self.falls - 1).min(5)));
+            let pause = LONGEST_PAUSE.min(FIRST_PAUSE * (1 << (self.crashes - 1).min(5)));
             self.restarted += 1;
-            self.tell(ProcessEventKind::Fell { how, again_after: pause, restart: self.restarted });
+            self.report(ProcessEventKind::Fell { how, again_after: pause, restart: self.restarted });
             tokio::select! {
                 () = tokio::time::sleep(pause) => {}
-                _ = asked_to_stop(self.stop.clone()) => return false,
+                _ = stop_requested(self.stop.clone()) => return false,
             }
         }
     }
@@ -133,26 +133,27 @@ impl Watcher {
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
             .stderr(self.log.file.try_clone()?)
-            // Ctrl-C on a terminal reaches a whole process group: ours alone, so that the fleet ends in order.
+            // Ctrl-C on a terminal reaches a whole process group: only that of this program, so that the fleet ends in
+            // order.
             .process_group(0)
             .kill_on_drop(true)
             .spawn()
     }
 
-    /// Tells how a process ended that was asked to. Returns whether it had to be killed.
-    fn ended_as_asked(&self, status: Option<ExitStatus>) -> bool {
+    /// Reports the end of a process after a request. Returns true if it had to be killed.
+    fn report_requested_end(&self, status: Option<ExitStatus>) -> bool {
         match status {
             None => return true,
-            // Before it listens to signals it has nothing to lose.
+            // Before it handles signals it has nothing to lose.
             Some(status) if is_done(status) || status.signal() == Some(Signal::TERM.as_raw()) => {
-                self.tell(ProcessEventKind::Done { data_lost: status.code() == Some(DATA_LOST) });
+                self.report(ProcessEventKind::Done { data_lost: status.code() == Some(DATA_LOST) });
             }
-            Some(status) => self.tell(ProcessEventKind::Failed { how: in_words(status) }),
+            Some(status) => self.report(ProcessEventKind::Failed { how: describe(status) }),
         }
         false
     }
 
-    /// Follows what a process prints, in a task that ends with its output.
+    /// Copies and passes on the output of a process, in a task that ends with the output.
     fn follow(&self, child: &mut Child) -> Option<JoinHandle<()>> {
         let (output, log) = (child.stdout.take()?, self.log.file.try_clone().ok()?);
         let (events, name) = (self.events.clone(), self.spec.name.clone());
@@ -162,20 +163,20 @@ impl Watcher {
     }
 
     fn give_up(&self, how: &str) -> bool {
-        let said = self.log.last_line().map_or(String::new(), |line| format!(": {line}"));
+        let last_line = self.log.last_line().map_or(String::new(), |line| format!(": {line}"));
         let is_optional = self.spec.life == RestartPolicy::Optional;
-        self.tell(ProcessEventKind::GaveUp { how: format!("{how}{said}"), is_optional });
+        self.report(ProcessEventKind::GaveUp { how: format!("{how}{last_line}"), is_optional });
         false
     }
 
-    fn tell(&self, what: ProcessEventKind) {
-        // Nobody listens any more once the run is over.
+    fn report(&self, what: ProcessEventKind) {
+        // Without a receiver, the run is over.
         let _ = self.events.send(ProcessEvent { name: self.spec.name.clone(), what });
     }
 }
 
 /// Resolves with the deadline for ending.
-async fn asked_to_stop(mut stop: watch::Receiver<Option<Instant>>) -> Instant {
+async fn stop_requested(mut stop: watch::Receiver<Option<Instant>>) -> Instant {
     match stop.wait_for(Option::is_some).await {
         Ok(deadline) => deadline.unwrap_or_else(Instant::now),
         // The supervisor is gone.
@@ -183,27 +184,27 @@ async fn asked_to_stop(mut stop: watch::Receiver<Option<Instant>>) -> Instant {
     }
 }
 
-/// Asks a process to end, kills it at the deadline. How it ended; `None`: it had to be killed.
+/// Sends SIGTERM to a process, then SIGKILL at the deadline. Returns its exit status; `None`: it had to be killed.
 async fn end(child: &mut Child, deadline: Instant) -> Option<ExitStatus> {
     if let Some(pid) = child.id().and_then(|pid| Pid::from_raw(i32::try_from(pid).ok()?)) {
-        // It may have ended in this very moment, which is as good.
+        // It may have ended at this moment, which is as good.
         let _ = kill_process(pid, Signal::TERM);
-        // Stopped, it would not hear.
+        // A stopped process does not handle SIGTERM.
         let _ = kill_process(pid, Signal::CONT);
     }
     if let Ok(Ok(status)) = tokio::time::timeout_at(deadline.into(), child.wait()).await {
         return Some(status);
     }
-    // The wait after the kill cannot fail to end; an error means that it is gone already.
+    // The wait after the kill cannot fail to end; an error means that the process has ended already.
     let _ = child.kill().await;
     None
 }
 
-/// How a process ended, once what it printed has been read.
-async fn heard_out<T>(report: Option<JoinHandle<()>>, status: T) -> T {
+/// Exit status of a process, once its output has been read.
+async fn read_out<T>(report: Option<JoinHandle<()>>, status: T) -> T {
     if let Some(report) = report {
-        // Whoever else holds its output open is not waited for.
-        let _ = tokio::time::timeout(LAST_WORDS, report).await;
+        // Another holder of its output is not waited for.
+        let _ = tokio::time::timeout(REPORT_TIMEOUT, report).await;
     }
     status
 }
@@ -212,12 +213,12 @@ fn is_done(status: ExitStatus) -> bool {
     status.success() || status.code() == Some(DATA_LOST)
 }
 
-/// Whether it has not ended by itself: by a signal, or in a panic.
+/// True if it has not ended by itself: by a signal, or in a panic.
 fn is_struck(status: ExitStatus) -> bool {
     matches!(status.code(), None | Some(PANIC))
 }
 
-fn in_words(status: ExitStatus) -> String {
+fn describe(status: ExitStatus) -> String {
     match (status.code(), status.signal()) {
         (Some(code), _) => format!("ended with code {code}"),
         (None, Some(signal)) => format!("was ended by signal {signal}"),

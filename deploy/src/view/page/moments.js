@@ -1,5 +1,5 @@
 "use strict";
-// Takes moments from the server, shows the newest, and keeps no more than that.
+// Fetches scene frames from the server, shows the newest, and keeps no others.
 
 function state(mode, text) {
   root.dataset.mode = mode;
@@ -11,7 +11,7 @@ function hint(text) {
   $("hint").hidden = false;
 }
 
-/// Live: moments as they come, each behind its length; the server keeps only the newest for us.
+/// Live: frames as they arrive, each after its length; the server keeps only the newest for each page.
 async function live() {
   const answer = await fetch(`live${location.search}`);
   const reader = answer.body.getReader();
@@ -32,7 +32,7 @@ async function live() {
       if (length) newest = rest.slice(4, 4 + length);
       rest = rest.slice(4 + length);
     }
-    // What goes wrong in here is our fault, and not the end of the run.
+    // An error in here is one of the page, and not the end of the run.
     try { if (newest) show(newest.buffer); } catch (error) { fail(String(error)); }
   }
 }
@@ -48,7 +48,7 @@ async function watch() {
 
 const tape = { timeline: [], at: -1, wanted: 0, busy: false, playing: null };
 
-/// Recorded: one moment at a time; while one is fetched only the last wish counts.
+/// Recorded: one frame at a time; during a fetch only the last request counts.
 async function seek(index) {
   tape.wanted = Math.min(tape.timeline.length - 1, Math.max(0, index));
   $("seek").value = String(tape.wanted);
@@ -77,7 +77,7 @@ function play(on) {
   $("play").textContent = on ? "pause" : "play";
 }
 
-/// Latency over the run; gaps are moments without detections.
+/// Latency over the run; gaps are frames without detections.
 function spark() {
   const chart = $("spark");
   const [scale, width, height] = [devicePixelRatio || 1, chart.clientWidth, 44];

@@ -1,5 +1,5 @@
 "use strict";
-// The scene from above, and how one moves about in it.
+// The scene from above, and its navigation.
 
 const canvas = $("scene");
 
@@ -79,7 +79,7 @@ function outline(pen, box, place, shade, line, filled, dash = []) {
   pen.beginPath();
   [[1, 1], [1, -1], [-1, -1], [-1, 1]].forEach(([a, b], index) => pen[index ? "lineTo" : "moveTo"](...corner(a, b)));
   pen.closePath();
-  // The nose: from the middle to the front.
+  // Heading: from the centre to the front.
   const [front, heart] = [corner(1, 0), corner(0.4, 0)];
   pen.moveTo(...heart);
   pen.lineTo(...front);
@@ -97,7 +97,7 @@ function outline(pen, box, place, shade, line, filled, dash = []) {
   }
 }
 
-/// Where a vehicle believes to be, a ring for its confidence, and a line to where it is.
+/// Estimated pose of a vehicle, a ring for its confidence, and a line to the true pose.
 function vehicleMark(pen, vehicle, place) {
   const at = vehicle.pose || vehicle.truth;
   if (!at) return;
@@ -136,7 +136,7 @@ function vehicleMark(pen, vehicle, place) {
   pen.fillText(vehicle.cav, u + 15, v - 8);
 }
 
-// ---- moving about ----
+// ---- navigation ----
 
 const fingers = new Map();
 canvas.addEventListener("pointerdown", (event) => {

@@ -1,5 +1,5 @@
 "use strict";
-// The page of `v2vloc view`: what all of it shares, and the panels beside the scene. scene.js draws, moments.js fetches.
+// Page of `v2vloc view`: shared state, and the panels beside the scene. scene.js draws, moments.js fetches.
 
 const $ = (id) => document.getElementById(id);
 const root = document.documentElement;
@@ -13,7 +13,7 @@ function fail(words) {
   root.dataset.error = words;
 }
 
-// A picture of a live run (`?frames=N`): the page counts as loaded only when so many moments have had time to come.
+// Screenshot of a live run (`?frames=N`): the page counts as loaded only after the time of so many frames.
 const still = /frames=(\d+)/.exec(location.search);
 if (still) {
   const hold = document.createElement("script");
@@ -21,7 +21,7 @@ if (still) {
   document.body.append(hold);
 }
 
-// ---- numbers for people ----
+// ---- formatting of numbers ----
 
 const number = (value, digits = 1) => (value === null || value === undefined ? "–" : value.toFixed(digits));
 const ms = (value) => (value === null || value === undefined ? "–" : `${number(value, value < 10 ? 1 : 0)} ms`);
@@ -44,7 +44,7 @@ function element(tag, attributes = {}, ...children) {
   return node;
 }
 
-// ---- the state of the page ----
+// ---- state of the page ----
 
 const view = { frame: null, points: null, zoom: 7, shift: [0, 0], turn: 0, follow: true, centre: [0, 0], hidden: new Set() };
 const order = []; // vehicles, in the order in which they were first seen: a colour each
@@ -54,7 +54,7 @@ const swatch = (cav) => {
 };
 const ink = (cav) => colour(swatch(cav).slice(4, -1));
 
-/// A moment: a JSON document behind its length, then three 16-bit numbers per point.
+/// A scene frame: a JSON document after its length, then three 16-bit numbers per point.
 function show(buffer) {
   const length = new DataView(buffer).getUint32(0, true);
   const frame = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));
@@ -101,19 +101,19 @@ function panels(frame) {
   table("messages", ["topic", "sent", "used", "dropped"], messageRows(frame.messages), "Nothing counted yet.");
   const rows = frame.processes.flatMap((process) =>
     process.stages.map((stage) => [`${process.process} · ${stage.stage}`, ms(stage.p50_ms), ms(stage.p95_ms)]));
-  table("processes", ["", "p50", "p95"], rows, "No process has told yet.");
+  table("processes", ["", "p50", "p95"], rows, "No process has reported yet.");
 }
 
 function vehicleCard(vehicle, ego) {
   const known = vehicle.confidence !== null;
-  const said = known ? `confidence ${number(vehicle.confidence, 2)}` : `no pose${vehicle.no_pose ? `: ${words(vehicle.no_pose)}` : ""}`;
+  const status = known ? `confidence ${number(vehicle.confidence, 2)}` : `no pose${vehicle.no_pose ? `: ${words(vehicle.no_pose)}` : ""}`;
   const error = vehicle.error_m === null ? "" : `, ${number(vehicle.error_m, 2)} m off`;
   return element("div", { class: "vehicle", swatch: swatch(vehicle.cav) },
-    element("p", {}, element("b", {}, vehicle.cav + (vehicle.cav === ego ? " (ego)" : "")), element("small", {}, said + error)),
+    element("p", {}, element("b", {}, vehicle.cav + (vehicle.cav === ego ? " (ego)" : "")), element("small", {}, status + error)),
     element("div", { class: "bar" }, element("i", { width: `${100 * (vehicle.confidence || 0)}%` })));
 }
 
-/// A topic's line: what its sender counts, and what is lost on the way to those who hear it.
+/// Row of a topic: the counters of its sender, and the losses at its receivers.
 function messageRows(messages) {
   const topics = new Map();
   for (const { topic, to, sent, received, dropped } of messages) {
@@ -139,10 +139,10 @@ function table(id, heads, rows, empty) {
 
 const STAGE_COLOURS = ["--cav5", "--cav0", "--cav1", "--cav3", "--cav2", "--cav4", "--detection"];
 
-/// The time from capture to detections: what the ego tells of, and before it how far its agent was when.
+/// Time from capture to detections: the stages of the ego, and before them those of its agent.
 function stages(frame) {
-  const told = frame.stages.map(({ stage, nanos }) => [stage, nanos / 1e6]);
-  const rest = frame.latency_ms === null ? null : frame.latency_ms - told.reduce((sum, [, time]) => sum + time, 0);
+  const timings = frame.stages.map(({ stage, nanos }) => [stage, nanos / 1e6]);
+  const rest = frame.latency_ms === null ? null : frame.latency_ms - timings.reduce((sum, [, time]) => sum + time, 0);
   const posed = frame.posed_ms !== null;
   const marks = [["sweep", frame.swept_ms], [frame.swept_ms === null ? "sweep and pose" : "pose", frame.posed_ms], [posed ? "map" : "agent", rest]];
   let before = 0;
@@ -152,8 +152,8 @@ function stages(frame) {
     before = until;
     return [[stage, time]];
   });
-  const parts = agent.concat(told).filter(([, time]) => time >= 0.05);
-  if (!parts.length) return $("stages").replaceChildren(element("p", { class: "empty" }, "No detections of this moment."));
+  const parts = agent.concat(timings).filter(([, time]) => time >= 0.05);
+  if (!parts.length) return $("stages").replaceChildren(element("p", { class: "empty" }, "No detections in this frame."));
   const sum = parts.reduce((total, [, time]) => total + time, 0);
   const shade = (index) => `var(${STAGE_COLOURS[index % STAGE_COLOURS.length]})`;
   $("stages").replaceChildren(

@@ -1,4 +1,5 @@
-//! Where a neighbour's map really lies: what both have seen has to lie on one another.
+//! Consensus alignment: estimates the motion that aligns a neighbour's feature map with the ego's by commonly observed
+//! cells.
 
 use tch::nn::{self, Init};
 use tch::{Kind, TchError, Tensor};
@@ -6,29 +7,29 @@ use tch::{Kind, TchError, Tensor};
 use crate::layers::Linear;
 use crate::warp::{BILINEAR, NEAREST, PADDING_ZEROS};
 
-/// Channels that cells are compared by.
+/// Channels by which cells are compared.
 const KEYS: i64 = 32;
-/// Weight below which a neighbour has nothing in common with the ego.
+/// Total weight below which a neighbour shares nothing with the ego.
 const TOO_LITTLE: f64 = 1e-6;
 
-/// Finds a small rigid motion from a few cells that both vehicles find worth sending.
+/// Estimates a small rigid motion from a few cells that both vehicles score as worth sending.
 ///
-/// Each of them is looked for around its place in the ego's map. Where it is found, as the mean over the search window
-/// weighed by similarity, gives one correspondence; the motion is the weighted least-squares fit of all (the planar case
-/// has a closed form). A cell that looks the same everywhere is found where it was, so it pulls towards no correction.
-/// Everything is differentiable, and the detection loss trains it.
+/// Each of these cells is matched in a window around its position in the ego's feature map. The mean position over that
+/// search window, weighted by similarity, gives one correspondence; the motion is the weighted least-squares fit of all
+/// (the planar case has a closed form). A cell that is similar everywhere matches at its own position, so it pulls
+/// towards no correction. Everything is differentiable and trained by the detection loss.
 #[derive(Debug)]
 pub(super) struct Consensus {
     key: Linear,
-    /// `[]` logarithm of how much a similarity counts.
+    /// `[]` logarithm of the sharpness of the similarity weights.
     sharpness: Tensor,
-    /// `[]` how much of a motion is believed, before the sigmoid.
+    /// `[]` share of the fitted motion that is applied, before the sigmoid.
     trust: Tensor,
     cells: i64,
     reach: i64,
 }
 
-/// A planar motion of a map about its middle, in cells: `ego = rotation * map + shift`.
+/// A planar motion of a feature map about its centre, in cells: `ego = rotation * map + shift`.
 #[derive(Debug)]
 pub(super) struct Motion {
     /// `[]` radians.
@@ -49,9 +50,9 @@ impl Consensus {
         }
     }
 
-    /// The motion that brings a neighbour's map `[H, W, C]` onto the ego's; nothing where they share nothing.
+    /// The motion that moves a neighbour's feature map `[H, W, C]` onto the ego's; `None` where they share no cell.
     ///
-    /// `weight` `[H, W]` says how much a cell matters to both, 0 where the neighbour has none.
+    /// `weight` `[H, W]` is the weight of a cell for both, 0 where the neighbour has none.
     pub(super) fn motion(&self, ego: &Tensor, other: &Tensor, weight: &Tensor) -> Result<Option<Motion>, TchError> {
         let (height, width, channels) = ego.size3()?;
         let count = self.cells.min(height * width);
@@ -63,7 +64,7 @@ impl Consensus {
         let offsets = self.offsets(ego)?;
         let rows = best.f_divide_scalar_mode(width, "floor")?;
         let columns = best.f_remainder(width)?;
-        // Beyond the edge the nearest cell stands in: a few cells of a window hardly matter.
+        // Beyond the edge the nearest cell is used: a few cells of a window hardly matter.
         let around = |at: &Tensor, axis: i64, length: i64| {
             let offset = offsets.f_select(1, axis)?.f_unsqueeze(0)?;
             at.f_unsqueeze(1)?.f_add(&offset)?.f_clamp(0, length - 1)
@@ -95,7 +96,7 @@ impl Consensus {
         Tensor::f_from_slice(&offsets)?.f_view([-1, 2])?.f_to_device(like.device())
     }
 
-    /// The motion of points `from` `[K, 2]` that have moved by `moved`, as far as it is believed.
+    /// The motion of points `from` `[K, 2]` by `moved`, scaled by the learnt share.
     fn fit(&self, from: &Tensor, moved: &Tensor, weight: &Tensor) -> Result<Motion, TchError> {
         let weight = weight.f_div(&(weight.f_sum(Kind::Float)? + TOO_LITTLE))?.f_unsqueeze(1)?;
         let mean = |x: &Tensor| (x * &weight).f_sum_dim_intlist([0i64].as_slice(), false, None::<Kind>);
@@ -105,7 +106,7 @@ impl Consensus {
         let [to_x, to_y] = [other.f_select(1, 0)?, other.f_select(1, 1)?];
         let flat = weight.f_squeeze_dim(1)?;
         let sine = ((&x * &to_y - &y * &to_x) * &flat).f_sum(Kind::Float)?;
-        // The more so the less the points spread: a turn needs a lever.
+        // Regularised the more, the less the points spread: a rotation needs a lever arm.
         let cosine = ((&x * &to_x + &y * &to_y) * &flat).f_sum(Kind::Float)? + 1.0;
         let trust = self.trust.f_sigmoid()?;
         let angle = sine.f_atan2(&cosine)? * &trust;
@@ -116,10 +117,10 @@ impl Consensus {
 }
 
 impl Motion {
-    /// A map `[H, W, C]` moved by it, zeros outside, and the mask `[H, W]` moved along.
+    /// A feature map `[H, W, C]` moved by this motion, zeros outside, and the mask `[H, W]` moved with it.
     pub(super) fn apply(&self, map: &Tensor, mask: &Tensor) -> Result<(Tensor, Tensor), TchError> {
         let (height, width, channels) = map.size3()?;
-        // From the ego's cells back to the map's: the transposed rotation of what is left without the shift.
+        // From the ego's cells back to the map's: the transposed rotation after the shift is subtracted.
         let back = -&self.angle;
         let from = -rotated(&back, &self.shift)?;
         let (sine, cosine) = (back.f_sin()?, back.f_cos()?);
@@ -143,7 +144,7 @@ impl Motion {
     }
 }
 
-/// A point `[2]` turned by an angle.
+/// A point `[2]` rotated by an angle.
 fn rotated(angle: &Tensor, point: &Tensor) -> Result<Tensor, TchError> {
     let (sine, cosine) = (angle.f_sin()?, angle.f_cos()?);
     let (x, y) = (point.f_get(0)?, point.f_get(1)?);
@@ -167,10 +168,10 @@ mod tests {
     }
 
     #[test]
-    fn a_map_that_lies_two_cells_off_is_brought_back() {
+    fn an_offset_of_two_cells_is_corrected() {
         let (_variables, consensus) = trusting();
         let ego = Tensor::randn([24, 32, 16], (Kind::Float, Device::Cpu));
-        // What the ego has at a column, the neighbour's map has two columns on and one row up.
+        // A feature of the ego at a column is two columns further and one row up in the neighbour's map.
         let other = ego.roll([2i64, -1].as_slice(), [1i64, 0].as_slice());
         let weight = Tensor::zeros([24, 32], (Kind::Float, Device::Cpu));
         let _ = weight.narrow(0, 6, 12).narrow(1, 6, 20).fill_(1.0);
@@ -195,7 +196,7 @@ mod tests {
         let to = from.matmul(&turn) + Tensor::from_slice(&shift.map(|value| value as f32));
         let motion = consensus.fit(&from, &(to - &from), &Tensor::ones([50], (Kind::Float, Device::Cpu))).unwrap();
         assert!((motion.angle.double_value(&[]) - angle).abs() < 2e-3, "{:?}", motion.angle);
-        // A map with one bright cell: it lands where the motion takes it.
+        // A feature map with one bright cell: it must land at the moved position.
         let map = Tensor::zeros([41, 41, 1], (Kind::Float, Device::Cpu));
         let _ = map.get(20 + 4).get(20 + 10).fill_(1.0);
         let (moved, _) = motion.apply(&map, &Tensor::ones([41, 41], (Kind::Float, Device::Cpu))).unwrap();

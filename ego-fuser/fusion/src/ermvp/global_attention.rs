@@ -1,4 +1,4 @@
-//! Attention within windows whose queries are the same for all: what the whole map is about.
+//! Window attention with global queries: queries summarise the whole feature map and are the same for all windows.
 
 use tch::nn;
 use tch::{Kind, TchError, Tensor};
@@ -10,10 +10,10 @@ use crate::swap_fusion::{OffsetTable, Slots};
 
 /// Share of the channels inside a squeeze.
 const SQUEEZE: i64 = 4;
-/// How much smaller the map is that the queries are taken from, along an edge.
+/// Reduction of the feature map that the queries are computed from, along an edge.
 pub(super) const REDUCTION: i64 = 4;
 
-/// A depthwise convolution with squeeze and excitation, added to what it started from, then half the resolution.
+/// A depthwise convolution with squeeze and excitation, added to its input, then half the resolution.
 #[derive(Debug)]
 struct Extract {
     depthwise: Tensor,
@@ -82,7 +82,7 @@ impl GlobalHalf {
         }
     }
 
-    /// A map `[S, H, W, C]` to the same. H and W are multiples of [`REDUCTION`] windows.
+    /// A feature map `[S, H, W, C]` to the same. H and W are multiples of [`REDUCTION`] windows.
     pub(super) fn forward(&self, map: &Tensor, slots: Slots<'_>, train: bool) -> Result<Tensor, TchError> {
         let &[count, height, width, channels] = &map.size()[..] else { return Err(shape_error(map)) };
         let x = self.norm.forward(map)?;
@@ -103,8 +103,8 @@ impl GlobalHalf {
         Ok(&x + self.feed_forward.forward(&self.feed_norm.forward(&x)?, train)?)
     }
 
-    /// One query for each token of a window, `[1, S * P, C]`: the mean over all windows of a smaller map, after the tokens
-    /// of each have looked at one another.
+    /// One query for each token of a window, `[1, S * P, C]`: the mean over all windows of a smaller feature map after
+    /// self-attention among the tokens of each window.
     fn queries(&self, x: &Tensor, slots: Slots<'_>) -> Result<Tensor, TchError> {
         let small = x.f_permute([0, 3, 1, 2])?.f_contiguous()?;
         let small =
@@ -115,7 +115,7 @@ impl GlobalHalf {
         let unseen = match slots.reach {
             None => None,
             Some(reach) => {
-                // A cell of the small map is seen where any of its cells is.
+                // A cell of the small feature map is valid where any of its cells is.
                 let step = [REDUCTION, REDUCTION];
                 let reach = reach.f_unsqueeze(1)?.f_max_pool2d(step, step, [0i64, 0], [1i64, 1], false)?;
                 let reach = reach.f_squeeze_dim(1)?;

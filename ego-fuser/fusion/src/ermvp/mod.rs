@@ -1,19 +1,21 @@
-//! ERMVP: few cells cross the air, agreement about them corrects poses, attention with local and global queries fuses.
+//! ERMVP: selection of cells, pose correction by consensus among them, attention with local and global queries.
 //!
-//! Zhang et al., CVPR 2024. What is its own is kept: cells are sampled by a learnt score, agreement between sampled cells
-//! moves a neighbour's map before it is fused, and each layer attends within windows with queries of the window and then
-//! with queries that stand for the whole map. What is simpler than in the paper, and what that costs:
+//! Zhang et al., CVPR 2024. The characteristic steps are kept: cells are sampled by a learnt score, consensus among
+//! sampled cells moves a neighbour's feature map before it is fused, and each layer attends within windows with queries
+//! of the window and then with queries that summarise the whole feature map. Simplifications, and their cost:
 //!
 //! - Similar cells among the sampled ones are not merged into clusters. Merging saves bytes and loses detail (the
-//!   published code computes it and fuses without it), so a message is larger here than the paper's, and the fused map not
-//!   worse.
-//! - Cells are sampled by the ego from maps that arrived whole. What is fused is what would have been sent, the traffic is
-//!   that of whole maps, and a sender could leave out as many cells as `kept` says.
+//!   published code computes it and fuses without it), so a message is larger here than the paper's, and the fused map
+//!   not worse.
+//! - Cells are sampled by the ego from feature maps that were received completely. The fused cells are those that would
+//!   have been sent; the traffic is that of complete feature maps. A sender could leave out all cells but the share
+//!   `kept`.
 //! - The correction is a soft search around each sampled cell and a closed-form fit. It reaches `search` cells and no
-//!   further, where matching over the whole map may find its way back from larger errors, or be led astray.
-//! - Queries from the whole map attend with the usual scale inside the softmax; the published code scales behind it, which
-//!   makes its queries almost uniform. Missing neighbours are masked there too, so that they change nothing.
-//! - The mean at the end is taken over those that reach a cell, and there is no second loss on the ego's map alone.
+//!   further; matching over the whole feature map may correct larger errors, or find a wrong match.
+//! - Queries from the whole feature map attend with the usual scale inside the softmax; the published code scales after
+//!   it, which makes its attention almost uniform. Missing neighbours are masked there too, so that they change
+//!   nothing.
+//! - The mean at the end is taken over the maps that reach a cell, and there is no second loss on the ego-only map.
 
 mod consensus;
 mod global_attention;
@@ -40,7 +42,7 @@ use super::swap_fusion::{HalfBlock, MeanHead, Slots, SwapFusionConfig};
 /// ERMVP.
 pub static METHOD: MethodSpec = MethodSpec {
     name: "ermvp",
-    summary: "feature maps, the cells worth sending, poses corrected by agreement about them (ERMVP)",
+    summary: "feature maps, the cells worth sending, poses corrected by consensus among them (ERMVP)",
     exchange: Exchange::Features,
     gate: None,
     runs_with_weights_of: &[],
@@ -55,20 +57,20 @@ pub struct ErmvpConfig {
     pub layers: SwapFusionConfig,
     /// Share of a neighbour's cells that are kept.
     pub kept: f64,
-    /// Cells that are compared to find out how a neighbour's map lies.
+    /// Number of cells that are compared to estimate the offset of a neighbour's feature map.
     pub compared: i64,
-    /// How far to each side such a cell is looked for, cells.
+    /// Search range to each side of such a cell, cells.
     pub search: i64,
 }
 
 impl ErmvpConfig {
-    /// The published sizes, for maps of `channels` (256 there).
+    /// The published sizes, for feature maps of `channels` (256 there).
     #[must_use]
     pub fn full(channels: i64) -> Self {
         Self { layers: SwapFusionConfig::full(channels), kept: 0.2, compared: 128, search: 2 }
     }
 
-    /// For live traffic on two cores; cells are half as large, so they are looked for twice as far.
+    /// For live traffic on two cores; cells are half as large, so the search range is twice as many cells.
     #[must_use]
     pub fn lean(channels: i64) -> Self {
         Self { layers: SwapFusionConfig::lean(channels), search: 3, ..Self::full(channels) }
@@ -83,7 +85,7 @@ impl ErmvpConfig {
         within("fusion.compared", self.compared, 1..=4096)?;
         within("fusion.search", self.search, 1..=16)?;
         if self.layers.count_missing {
-            let must = "false: only agents that are there are fused";
+            let must = "false: only present agents are fused";
             return Err(ConfigError::Value { field: "fusion.layers.count_missing", value: "true".into(), must });
         }
         if !(self.kept > 0.0 && self.kept <= 1.0) {
@@ -146,7 +148,7 @@ impl Ermvp {
         })
     }
 
-    /// What is fused: maps `[N, H, W, C]` of the cells that are kept, corrected, and where they are, `[N, H, W]`.
+    /// Input of the fusion: maps `[N, H, W, C]` of the selected cells, corrected, and their mask, `[N, H, W]`.
     fn received(&self, maps: &Tensor, reach: &Tensor) -> Result<(Tensor, Tensor), TchError> {
         let agents = maps.size()[0];
         let scores = self.sampler.scores(maps)?;
@@ -194,7 +196,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_cannot_be_built_is_named() {
+    fn invalid_settings_are_named() {
         assert!(ErmvpConfig::full(256).validate().is_ok());
         assert!(ErmvpConfig::lean(64).validate().is_ok());
         let message = |config: ErmvpConfig| config.validate().unwrap_err().to_string();

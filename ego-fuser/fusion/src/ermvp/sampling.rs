@@ -1,4 +1,4 @@
-//! Which cells of a neighbour are worth sending.
+//! Sampling: selects the cells of a neighbour that are worth sending.
 
 use tch::nn;
 use tch::{Kind, TchError, Tensor};
@@ -18,7 +18,7 @@ impl Sampler {
     pub(super) fn new(path: &nn::Path<'_>, channels: i64, share: f64) -> Self {
         let path = path / "score_pred_net";
         let score = Linear::residual(&(&path / 2), channels, 1, true);
-        // Near one at the start, so that what is kept arrives as it was sent.
+        // Near one at the start, so that selected cells are passed on almost unchanged.
         let _ = score.bias.as_ref().map(|bias| tch::no_grad(|| bias.shallow_clone().fill_(2.0)));
         Self { hidden: Linear::new(&(&path / 0), channels, channels, true), score, share }
     }
@@ -28,10 +28,10 @@ impl Sampler {
         self.score.forward(&self.hidden.forward(maps)?.f_relu()?)?.f_squeeze_dim(3)?.f_sigmoid()
     }
 
-    /// 1 at the cells that are kept: all of the ego, which sends nothing, and of each neighbour those with the best scores
-    /// among the cells that it reaches.
+    /// 1 at the cells that are kept: all of the ego, which sends nothing, and of each neighbour those with the best
+    /// scores among the cells that it reaches.
     ///
-    /// `scores` and `reach` are `[N, H, W]`, and so is what comes back.
+    /// `scores`, `reach` and the result are `[N, H, W]`.
     pub(super) fn kept(&self, scores: &Tensor, reach: &Tensor) -> Result<Tensor, TchError> {
         let (agents, height, width) = scores.size3()?;
         if agents == 1 {
@@ -41,7 +41,7 @@ impl Sampler {
         let count = ((cells as f64 * self.share) as i64).clamp(1, cells);
         let reach_of_others = reach.f_narrow(0, 1, agents - 1)?;
         let ranked = scores.f_detach()?.f_narrow(0, 1, agents - 1)?;
-        // Scores are above zero, so what is out of reach comes last.
+        // Scores are above zero, so cells out of reach rank last.
         let ranked = (ranked * &reach_of_others).f_view([agents - 1, cells])?;
         let (_, best) = ranked.f_topk(count, 1, true, false)?;
         let kept = ranked.f_zeros_like()?.f_scatter_value(1, &best, 1.0)?.f_view([agents - 1, height, width])?;

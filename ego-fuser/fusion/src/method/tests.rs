@@ -32,7 +32,7 @@ fn fuse(fusion: &dyn Fusion, features: &Tensor, reach: &[f32]) -> Tensor {
     fuse_of(fusion, features, reach, &agents)
 }
 
-/// The same for maps of these agents, each of which stands somewhere else.
+/// The same for maps of these agents, each at another position.
 fn fuse_of(fusion: &dyn Fusion, features: &Tensor, reach: &[f32], agents: &[usize]) -> Tensor {
     let mask = Tensor::from_slice(reach).view([-1, 1, 1, 1]).expand([-1, 1, SHAPE[1], SHAPE[2]], false);
     let facts: Vec<_> = (agents.iter())
@@ -54,10 +54,10 @@ fn difference(one: &Tensor, other: &Tensor) -> f64 {
 fn masked_neighbours_change_nothing() {
     let features = random(3);
     for (method, fusion) in all() {
-        let alone = fuse(&*fusion, &features.narrow(0, 0, 1), &[1.0]);
-        assert!(alone.isfinite().all().double_value(&[]) == 1.0, "{method}");
+        let ego_only = fuse(&*fusion, &features.narrow(0, 0, 1), &[1.0]);
+        assert!(ego_only.isfinite().all().double_value(&[]) == 1.0, "{method}");
         let masked = fuse(&*fusion, &features, &[1.0, 0.0, 0.0]);
-        assert!(difference(&alone, &masked) < 1e-4, "{method}");
+        assert!(difference(&ego_only, &masked) < 1e-4, "{method}");
     }
 }
 
@@ -65,10 +65,10 @@ fn masked_neighbours_change_nothing() {
 fn neighbours_that_are_seen_change_something_unless_maps_are_not_exchanged() {
     let features = random(3);
     for (method, fusion) in all() {
-        let alone = fuse(&*fusion, &features.narrow(0, 0, 1), &[1.0]);
+        let ego_only = fuse(&*fusion, &features.narrow(0, 0, 1), &[1.0]);
         let together = fuse(&*fusion, &features, &[1.0, 1.0, 1.0]);
         let shares_maps = method.exchange() == Exchange::Features;
-        assert_eq!(difference(&alone, &together) > 1e-4, shares_maps, "{method}");
+        assert_eq!(difference(&ego_only, &together) > 1e-4, shares_maps, "{method}");
     }
 }
 
@@ -104,8 +104,8 @@ fn every_parameter_learns() {
         }
         (fused * random(1)).sum(Kind::Float).backward();
         for (name, variable) in variables.variables() {
-            // What belongs to another type of agent has nothing to learn from vehicles, and what recalls earlier maps
-            // nothing from the newest.
+            // Parameters of another agent type get no gradient from vehicles, and the temporal feature memory none from
+            // the newest maps.
             let is_idle = name.contains("linears.1.") || name.starts_with("recall.") || !variable.requires_grad();
             let learns = variable.grad().defined() && variable.grad().isfinite().all().double_value(&[]) == 1.0;
             assert!(learns || is_idle, "{method}: {name}");
@@ -144,7 +144,7 @@ fn settings_come_back_from_json_and_unknown_ones_are_named() {
     assert!(error("{}").contains("kind"));
 }
 
-/// A method as a research group would add it: settings, module and specification, and nothing elsewhere.
+/// A method as an external group would add it: settings, module and specification, and nothing elsewhere.
 mod mean {
     use perception::model_config::{ConfigError, DetectorConfig};
     use serde::{Deserialize, Serialize};

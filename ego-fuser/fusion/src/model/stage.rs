@@ -1,5 +1,5 @@
-//! From the maps of several vehicles to one: orientation-conditioned mixing of channels, warp (Eq. 2), fusion. Training and the
-//! ego run the same lines.
+//! Fusion stage: orientation-conditioned channel mixing, warp (Eq. 2) and fusion of several vehicles' feature maps.
+//! Training and the ego run the same code.
 
 use std::borrow::Cow;
 
@@ -19,13 +19,13 @@ use crate::settings::{FUSION_KEY, FusionConfig, Requirements};
 use crate::warp::{Order, WarpError, WarpedMaps, warp_in_order};
 use crate::{Fusion, FusionOutput};
 
-/// Where the fusion's variables lie in a weights file.
+/// Prefix of the fusion's variables in a weights file.
 pub(crate) const FUSION_PREFIX: &str = "fusion.";
 
-/// Why a fusion cannot be read from a weights file.
+/// Error of reading a fusion from a weights file.
 #[derive(Debug, thiserror::Error)]
 pub enum StageError {
-    /// Its configuration is none.
+    /// The configuration is invalid.
     #[error(transparent)]
     Config(#[from] ConfigError),
     /// The weights do not fit.
@@ -43,13 +43,14 @@ pub struct FusionStage {
     /// For a fusion that needs earlier maps at full resolution.
     classes: Option<Classes>,
     grid: BevGrid,
-    /// In which world the maps are.
+    /// Handedness of the frame of the feature maps.
     y_axis: YAxis,
 }
 
 impl FusionStage {
-    /// The fusion of `method` with random parameters below `path`: `fusion.*`, where maps are exchanged `steering.weight` and,
-    /// where earlier maps are needed at full resolution, the detector's `cls_head.*` unless that has made them.
+    /// The fusion of `method` with random parameters below `path`: `fusion.*`, where maps are exchanged
+    /// `steering.weight` and, where earlier maps are needed at full resolution, the detector's `cls_head.*` unless that
+    /// has made them.
     ///
     /// # Errors
     /// [`ConfigError`] names the field that no fusion can be built from.
@@ -69,7 +70,7 @@ impl FusionStage {
         Ok(Self { config: config.clone(), requirements, fusion, steering, classes, grid, y_axis })
     }
 
-    /// The fusion of a weights file, or the one of `method` where it is another and has no parameters.
+    /// The fusion of a weights file, or the one of `method` where it differs and has no parameters.
     ///
     /// # Errors
     /// [`StageError`] names the file and the first parameter that is missing or of another shape.
@@ -84,8 +85,8 @@ impl FusionStage {
         Ok(stage)
     }
 
-    /// The fusion of `method` around a network without weights of its own: its parameters are random, channels stay as
-    /// they come.
+    /// The fusion of `method` behind a network without fusion weights: its parameters are random, channels are not
+    /// mixed.
     ///
     /// # Errors
     /// [`ConfigError`] names the field that no fusion can be built from.
@@ -95,7 +96,7 @@ impl FusionStage {
         Ok(Self { steering: None, ..Self::new(&variables.root(), &config, method, detector)? })
     }
 
-    /// What the fusion was built from.
+    /// Settings that the fusion was built from.
     #[must_use]
     pub fn config(&self) -> &FusionConfig {
         &self.config
@@ -107,8 +108,8 @@ impl FusionStage {
         &self.requirements
     }
 
-    /// Warps maps onto the ego's grid: `received` are `N`, each in the axes of its sender, as are `metadata`: the ego's newest
-    /// first, then the newest of all others, then earlier ones.
+    /// Warps maps onto the ego's grid: `received` are `N`, each in the axes of its sender, as are `metadata`: the ego's
+    /// newest first, then the newest of all others, then earlier ones.
     ///
     /// # Errors
     /// [`WarpError`] when the maps do not lie on the grid or metadata are missing.
@@ -123,7 +124,7 @@ impl FusionStage {
         self.align_with(&received.only(0, newest.min(count))?, Some(earlier), metadata)
     }
 
-    /// The form of maps in which they are kept for later frames, given the same maps in the axes of the ego, `turned`
+    /// The form in which maps are kept for later frames, given the same maps in the axes of the ego, `turned`
     /// `[N, C, H, W]`.
     ///
     /// # Errors
@@ -134,7 +135,7 @@ impl FusionStage {
         let kept = match history.earlier_cells {
             Some(cells) => ReceivedMaps::new(
                 cell_by_cell(&larger_cells(maps, cells)?)?,
-                // A larger cell was sent where any of its cells was.
+                // A pooled cell was sent where any of its cells was.
                 sent.as_ref().map(|sent| larger_cells(sent, cells)?.f_ceil()).transpose()?,
             ),
             None => ReceivedMaps::new(maps.shallow_clone(), sent.as_ref().map(Tensor::shallow_clone)),
@@ -155,7 +156,7 @@ impl FusionStage {
         }
     }
 
-    /// [`Self::align`] with earlier maps as they were [`Self::kept`].
+    /// [`Self::align`] with earlier maps in the form of [`Self::kept`].
     ///
     /// # Errors
     /// [`WarpError`] when the maps do not lie on the grid or metadata are missing.
@@ -172,7 +173,7 @@ impl FusionStage {
             return Err(WarpError::PoseCount { maps, poses: metadata.len() });
         }
         let cells = self.requirements.history.earlier_cells;
-        // A fusion that needs earlier maps with larger cells takes the maximum over the newest, cell by cell.
+        // A fusion with pooled earlier maps takes the maximum over the newest, cell by cell.
         let order = if cells.is_some() { Order::Cells } else { Order::Planes };
         let earlier = match (cells, earlier) {
             (Some(cells), Some(earlier)) => {
@@ -218,12 +219,12 @@ impl FusionStage {
     /// Fuses aligned maps into one in the frame of the ego.
     ///
     /// # Errors
-    /// [`WarpError::Torch`] when the tensor library refuses.
+    /// [`WarpError::Torch`] when the tensor library reports an error.
     pub fn fuse(&self, maps: &AlignedMaps) -> Result<FusionOutput, WarpError> {
         Ok(self.fusion.fuse(maps)?)
     }
 
-    /// Metadata in the world of the network: a mirrored one has mirrored poses.
+    /// Metadata in the frame of the network: a mirrored network has mirrored poses.
     fn of_network<'a>(&self, metadata: &'a [MapMetadata]) -> Cow<'a, [MapMetadata]> {
         if self.y_axis == YAxis::Left {
             return Cow::Borrowed(metadata);
@@ -233,14 +234,14 @@ impl FusionStage {
     }
 }
 
-/// How many of the first entries are the newest of their agents.
+/// Number of leading entries that are the newest of their agents.
 fn newest(facts: &[MapMetadata]) -> usize {
     let is_first = |(entry, of): &(usize, &MapMetadata)| facts[..*entry].iter().all(|before| before.agent != of.agent);
     facts.iter().enumerate().take_while(is_first).count()
 }
 
-/// Poses of the entries from `newest` on in the frame that the ego had when they were the newest of their agents: its own
-/// entry as many steps back tells of it, and where there is none it counts as standing still.
+/// Poses of the entries from `newest` on in the frame that the ego had when they were the newest of their agents. The
+/// ego's own entry of the same time step gives that frame; without one the ego counts as stationary.
 fn then_from_cav(facts: &[MapMetadata], newest: usize) -> Vec<Pose> {
     let step = |entry: usize| facts[..entry].iter().filter(|before| before.agent == facts[entry].agent).count();
     let ego_of = |wanted: usize| (0..facts.len()).find(|&entry| facts[entry].agent == 0 && step(entry) == wanted);
@@ -254,7 +255,7 @@ fn then_from_cav(facts: &[MapMetadata], newest: usize) -> Vec<Pose> {
     (newest..facts.len()).map(of_entry).collect()
 }
 
-/// Maps with the channels of a cell side by side in memory, where no gradient flows.
+/// Maps with the channels of a cell contiguous in memory, where no gradient flows.
 fn cell_by_cell(maps: &Tensor) -> Result<Tensor, TchError> {
     match are_numbers(maps) {
         true => maps.f_permute([0, 2, 3, 1])?.f_contiguous()?.f_permute([0, 3, 1, 2]),
@@ -282,7 +283,7 @@ mod tests {
 
     use super::*;
 
-    /// A network of a mirrored world gets mirrored maps and answers with a mirrored one.
+    /// A mirrored network gets mirrored maps and returns a mirrored one.
     #[test]
     fn a_mirrored_world_is_fused_like_this_one() {
         tch::set_num_threads(1);
@@ -308,7 +309,7 @@ mod tests {
     fn earlier_maps_are_turned_as_when_they_were_the_newest() {
         let turned = |yaw_rad: f64| Pose::from_xyz_yaw([1.0, 2.0, 0.0], yaw_rad);
         let fact = |agent: usize, yaw_rad: f64| MapMetadata::fresh(agent, turned(yaw_rad));
-        // The ego has turned by 0.1 since; of a third time step it has no map.
+        // The ego has turned by 0.1 since; it has no map of a third time step.
         let facts = [MapMetadata::fresh(0, Pose::IDENTITY), fact(1, 0.7), fact(0, -0.1), fact(1, 0.5), fact(1, 0.4)];
         let yaws: Vec<f64> = then_from_cav(&facts, 2).iter().map(Pose::yaw_rad).collect();
         assert!(yaws.iter().zip([0.0, 0.6, 0.4]).all(|(found, expected)| (found - expected).abs() < 1e-9), "{yaws:?}");

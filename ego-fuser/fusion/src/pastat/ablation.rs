@@ -28,11 +28,11 @@ pub fn ablated(fusion: &FusionConfig, without: &[Part], frames: Option<usize>) -
             return Ok(fusion.clone());
         }
         let value = format!("without {without:?}, {frames:?} frames");
-        return Err(ConfigError::Value { field: "fusion", value, must: "as it is but for pastat" });
+        return Err(ConfigError::Value { field: "fusion", value, must: "unchanged for methods other than pastat" });
     };
     let mut config = without.iter().fold(config.clone(), |config, &part| without_part(config, part));
     config.frames = frames.unwrap_or(config.frames);
-    // One time step leaves nothing to remember.
+    // With one time step there is nothing to remember.
     if config.frames == 1 {
         config = without_part(config, Part::TemporalMemory);
     }

@@ -1,7 +1,8 @@
 //! Coarse alignment (the A of Eq. 2): maps warped onto the ego's grid by the poses of their senders.
 //!
-//! The warp itself is that of all methods ([`crate::warp`]). Here the entries are picked that reach any cell, so nothing is
-//! padded over agents or time, and their grids are padded to what attention windows and FSA divide them into.
+//! The warp itself is that of all methods ([`crate::warp`]). Here the entries that reach any cell are selected, so
+//! nothing is padded over agents or time, and their grids are padded to multiples of the attention windows and of the
+//! parts of FSA.
 
 use protocol::Pose;
 use tch::{Kind, TchError, Tensor};
@@ -11,30 +12,30 @@ use crate::maps::{AlignedMaps, MapMetadata};
 use crate::padding::Padding;
 use crate::warp::WarpedMaps;
 
-/// Picks and pads the entries of a sample.
+/// Selects and pads the entries of a sample.
 #[derive(Debug)]
 pub(super) struct CoarseAlignment {
-    /// Cells that the newest maps' rows and columns are multiples of.
+    /// Rows and columns of the newest maps are padded to multiples of so many cells.
     padding_cells: i64,
     /// The same of earlier maps.
     earlier_padding_cells: i64,
 }
 
-/// Coarsely aligned maps: the entries of a sample that reach any cell. A map that reaches none takes no part and has no share
-/// of the confidence either.
+/// Coarsely aligned maps: the entries of a sample that reach any cell. A map that reaches none is left out and has no
+/// share of the confidence either.
 #[derive(Debug)]
 pub(super) struct CoarseMaps {
     /// The newest map of each agent, the ego's first, on the padded grid of the ego.
     pub(super) newest: WarpedMaps,
-    /// The same in the frames of their senders, not padded; the mask says which cells were sent.
+    /// The same in the frames of their senders, not padded; the mask marks the cells that were sent.
     pub(super) received: WarpedMaps,
-    /// Earlier maps with larger cells, on a padded grid of the ego.
+    /// Earlier maps, pooled, on a padded grid of the ego.
     pub(super) earlier: Option<WarpedMaps>,
-    /// Places of these among [`AlignedMaps::earlier`].
+    /// Indices of these among [`AlignedMaps::earlier`].
     pub(super) earlier_entries: Vec<usize>,
     /// Origins of the newest and of the earlier maps, in this order.
     pub(super) origins: Origins,
-    /// Places of all entries in the input, and how many there are.
+    /// Indices of all entries in the input, and the number of entries there.
     places: Vec<i64>,
     all: i64,
 }
@@ -47,7 +48,7 @@ pub(super) struct Origins {
     /// Confidence of the sender's pose, 0..1.
     pub(super) confidence: Vec<f64>,
     pub(super) age_secs: Vec<f64>,
-    /// Places among the maps of the same agent, 0 for the newest.
+    /// Index among the maps of the same agent, 0 for the newest.
     pub(super) steps_back: Vec<usize>,
 }
 
@@ -94,7 +95,8 @@ impl CoarseAlignment {
 }
 
 impl CoarseMaps {
-    /// `[N - 1, 3]` of all entries of the input but the first, given `corrections` of those that are here: others have none.
+    /// `[N - 1, 3]` of all entries of the input but the first, given `corrections` of the selected ones: others have
+    /// none.
     pub(super) fn among_all(&self, corrections: &Tensor) -> Result<Tensor, TchError> {
         if self.places.len() as i64 == self.all {
             return Ok(corrections.shallow_clone());
@@ -118,13 +120,13 @@ impl Origins {
         }
     }
 
-    /// How many entries there are.
+    /// Number of entries.
     pub(super) fn count(&self) -> usize {
         self.agent.len()
     }
 }
 
-/// The place of every entry among those of its agent, 0 for the newest; of two of one age the first is the newer.
+/// Index of every entry among those of its agent, 0 for the newest; of two of one age the first is the newer.
 pub(super) fn steps_back(agent: &[usize], age_secs: &[f64]) -> Vec<usize> {
     let is_newer = |a: usize, b: usize| age_secs[a] < age_secs[b] || (age_secs[a] == age_secs[b] && a < b);
     (0..agent.len())

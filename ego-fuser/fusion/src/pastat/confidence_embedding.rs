@@ -1,4 +1,4 @@
-//! CE, Confidence Embedding (Eq. 7): the share of each pose in the confidence of all, appended to the features of its map.
+//! CE, Confidence Embedding (Eq. 7): appends the share of each pose in the total confidence to the features of its map.
 
 use std::collections::BTreeMap;
 
@@ -8,17 +8,17 @@ use tch::{Device, TchError, Tensor};
 use super::coarse_alignment::Origins;
 use super::config::PastatConfig;
 
-/// Numbers of each entry that FSA gets: its share, its confidence and the ego's. Shares alone do not tell whether all poses
-/// are good or all are bad.
+/// Values of each entry that FSA gets: its share, its confidence and the ego's. Shares alone do not distinguish all
+/// poses good from all poses bad.
 pub(super) const CONFIDENCES: i64 = 3;
 
 /// Appends the channel of Eq. 7 to maps.
 ///
-/// That channel has one value all over a map, so its part of a token is the weight of the channel times that value, whichever
-/// cells the token is of; the channel itself need not be built.
+/// The channel is constant over a map, so its part of a token is the channel's weight times that value for every cell;
+/// the channel itself is not built.
 #[derive(Debug)]
 pub(super) struct ConfidenceEmbedding {
-    /// `[D]`: the weight of the channel in the patch embedding; absent: there is no such channel, for the ablation.
+    /// `[D]`: the weight of the channel in the patch embedding; absent: no such channel, for the ablation.
     weight: Option<Tensor>,
     device: Device,
 }
@@ -28,7 +28,7 @@ pub(super) struct ConfidenceEmbedding {
 pub(super) struct Confidences {
     /// `[N, D]`: its part of the tokens of each entry.
     pub(super) of_tokens: Option<Tensor>,
-    /// `[N, CONFIDENCES]`: what FSA gets; zeros without the embedding.
+    /// `[N, CONFIDENCES]`: input of FSA; zeros without the embedding.
     pub(super) of_maps: Tensor,
 }
 
@@ -59,7 +59,7 @@ impl ConfidenceEmbedding {
 
 /// `sigma_i / sum_j sigma_j` of every entry, the sum over the agents that have an entry of the same time step.
 ///
-/// An ego alone has 1. Where nobody is trusted at all, all are trusted alike.
+/// An ego without neighbours has 1. If all confidences are zero, the shares are equal.
 pub(super) fn shares(confidence: &[f64], steps_back: &[usize]) -> Vec<f32> {
     let mut sums: BTreeMap<usize, (f64, usize)> = BTreeMap::new();
     for (&sigma, &step) in confidence.iter().zip(steps_back) {
@@ -82,7 +82,7 @@ mod tests {
     use crate::pastat::coarse_alignment::steps_back;
 
     #[test]
-    fn alone_the_share_is_one_and_two_divide_it_by_their_confidence() {
+    fn ego_only_the_share_is_one_and_two_divide_it_by_their_confidence() {
         assert_eq!(shares(&[0.2], &[0]), [1.0]);
         assert_eq!(shares(&[0.0], &[0]), [1.0]);
         assert_eq!(shares(&[0.9, 0.3], &[0, 0]), [0.75, 0.25]);

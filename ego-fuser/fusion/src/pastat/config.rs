@@ -5,17 +5,17 @@ use serde::{Deserialize, Serialize};
 
 use super::spatial_alignment::correlation::PARTS;
 
-/// Which tokens ask in the attention over agents and time.
+/// Tokens that are queries in the attention over agents and time.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Rows {
-    /// Those of the ego's newest map alone: in the end only they are kept. Maps of others stay as they came.
+    /// Those of the ego's newest map only: only they are used in the end. Maps of others are unchanged.
     Ego,
-    /// All in every block but the last: maps of others learn of each other too.
+    /// All in every block but the last: maps of others attend to each other too.
     All,
 }
 
-/// How the wavelengths of the temporal encoding grow with the channel.
+/// Wavelengths of the temporal encoding as a function of the channel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Wavelengths {
@@ -29,31 +29,31 @@ pub enum Wavelengths {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct FsaConfig {
-    /// Channels that maps are compared in.
+    /// Channels in which maps are compared.
     pub matching: i64,
-    /// Cells are compared with those of the ego up to so many cells away, along x and along y.
+    /// Largest offset between compared cells, cells along x and along y.
     pub radius: i64,
     /// Neurons of the fully connected layer.
     pub hidden: i64,
-    /// Largest shift of one look along x or y, metres.
+    /// Largest shift of one comparison along x or y, metres.
     pub max_shift_m: f64,
-    /// Largest turn of one look, radians.
+    /// Largest rotation of one comparison, radians.
     pub max_turn_rad: f64,
-    /// The search for maps that are further away than all that; absent: such maps stay where they are.
+    /// The search for maps with a larger offset; absent: such maps are not moved.
     #[serde(default, rename = "search")]
     pub alignment_search: Option<SearchConfig>,
 }
 
-/// The search for a map that lies far from where its pose puts it.
+/// The search for a map with a large offset from its pose.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SearchConfig {
-    /// So many cells along each edge are taken together.
+    /// Edge of the squares of cells that are pooled, cells.
     pub cells: i64,
-    /// Maps are looked for up to so many of these larger cells away, along x and along y.
+    /// Largest offset of the search, pooled cells along x and along y.
     pub radius: i64,
-    /// In training a map is moved when its correlation with the ego's is higher elsewhere by more than this. Once trained,
-    /// what is higher there by anything is compared closely at both places.
+    /// In training a map is moved when its correlation with the ego's is higher elsewhere by more than this. After
+    /// training, any higher correlation leads to a fine comparison at both places.
     pub margin: f64,
 }
 
@@ -74,9 +74,9 @@ impl Default for FsaConfig {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct MemoryConfig {
-    /// Channels from which it is told how much of an earlier map is taken.
+    /// Channels of the layer that predicts the weight of an earlier map.
     pub hidden: i64,
-    /// In such a share of all tokens' patches, those where vehicles are most likely.
+    /// Share of all tokens' patches that are blended, those where vehicles are most likely.
     pub share: f64,
 }
 
@@ -105,26 +105,26 @@ pub struct PastatConfig {
     pub mlp_ratio: i64,
     /// Edges of the attention windows, tokens; each has its equal share of the heads.
     pub windows: Vec<i64>,
-    /// Which tokens ask.
+    /// Tokens that are queries.
     pub rows: Rows,
-    /// Channels inside the two convolutions that sharpen the fused map; absent: there are none.
+    /// Channels inside the two convolutions that refine the fused map; absent: no refinement.
     #[serde(default, rename = "refine")]
     pub map_refinement: Option<i64>,
-    /// How earlier maps are blended into the newest; absent: they take part through their tokens alone.
+    /// Blending of earlier maps into the newest; absent: they take part through their tokens only.
     #[serde(default, rename = "recall", skip_serializing_if = "Option::is_none")]
     pub temporal_memory: Option<MemoryConfig>,
     /// Time steps wanted of every agent, the T of the paper.
     pub frames: usize,
-    /// Along each edge so many cells of a map from before its agent's newest are taken together before it is moved: what
-    /// is a few steps old need not be known to the cell.
+    /// Edge of the squares of cells that are pooled in earlier maps before the warp: maps a few steps old do not need
+    /// full resolution.
     pub earlier_cells: i64,
-    /// Time from one step to the next that the temporal encoding counts in, seconds.
+    /// Time from one step to the next in the temporal encoding, seconds.
     pub frame_secs: f64,
-    /// Whether poses' confidences are embedded (Eq. 7).
+    /// True if poses' confidences are embedded (Eq. 7).
     pub ce: bool,
-    /// Feature Spatial Alignment; absent: maps stay where poses put them.
+    /// Feature Spatial Alignment; absent: maps are aligned by their poses only.
     pub fsa: Option<FsaConfig>,
-    /// Temporal encoding (Eq. 10-12); absent: the age of a map is not known.
+    /// Temporal encoding (Eq. 10-12); absent: the age of a map is not encoded.
     pub te: Option<Wavelengths>,
 }
 
@@ -170,8 +170,8 @@ impl PastatConfig {
         }
     }
 
-    /// Maps are padded to multiples of this many cells, so that tokens fill every window and cells every part that FSA
-    /// compares.
+    /// Maps are padded to multiples of this many cells, so that tokens fill every window and cells fill every part of
+    /// FSA.
     #[must_use]
     pub fn padding_cells(&self) -> i64 {
         let larger = |fsa: &FsaConfig| {
@@ -284,7 +284,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_built_is_named() {
+    fn invalid_settings_are_named() {
         let recall = |memory| PastatConfig { temporal_memory: Some(memory), ..PastatConfig::lean(64) };
         for (config, part) in [
             (PastatConfig { dim: 36, ..PastatConfig::lean(64) }, "dim is 36"),

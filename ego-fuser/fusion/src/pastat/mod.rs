@@ -1,8 +1,8 @@
 //! PASTAT, the Pose-Aware Spatio-Temporal Alignment Transformer.
 //!
-//! One module a step, in the order of the paper: coarse alignment (Eq. 2), CE (Eq. 7), FSA, TE (Eq. 10-12), transformer (Eq. 8,
-//! 9), decoder. Steps that are not in the paper are in [`extensions`]. Untrained, all are neutral: the fusion begins as the
-//! element-wise maximum.
+//! One module per step, in the order of the paper: coarse alignment (Eq. 2), CE (Eq. 7), FSA, TE (Eq. 10-12),
+//! transformer (Eq. 8, 9), decoder. Steps that are not in the paper are in `extensions`. Untrained, all are neutral:
+//! the fusion begins as the element-wise maximum.
 
 mod ablation;
 mod coarse_alignment;
@@ -127,7 +127,7 @@ impl Fusion for Pastat {
     }
 }
 
-/// `[1, C, H, W]` without the padding, of which nothing is known, given maps that have none.
+/// `[1, C, H, W]` without the padding, given maps without padding.
 fn cropped(padded: &Tensor, maps: &Tensor) -> Result<Tensor, TchError> {
     let (_, _, height, width) = maps.size4()?;
     padded.f_narrow(2, 0, height)?.f_narrow(3, 0, width)

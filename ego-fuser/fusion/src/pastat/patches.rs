@@ -16,7 +16,7 @@ pub(super) struct Patches {
     earlier_cells: i64,
 }
 
-/// Tokens of maps, before anything else is known of these.
+/// Tokens of maps, before encodings are added.
 #[derive(Debug)]
 pub(super) struct PatchTokens {
     /// `[N, D, h, w]`.
@@ -47,7 +47,7 @@ impl Patches {
     fn values(&self, maps: &Tensor, cells: i64) -> Result<Tensor, TchError> {
         let nn::Conv2D { ws, bs, .. } = &self.convolution;
         let edge = self.patch / cells;
-        // As if each of the cells that were taken together showed their mean.
+        // Equal to all pooled cells showing their mean.
         let weight = match cells {
             1 => ws.shallow_clone(),
             _ => ws.f_avg_pool2d([cells, cells], [cells, cells], [0_i64, 0], false, true, None::<i64>)?,
@@ -59,8 +59,8 @@ impl Patches {
         maps.f_conv2d(&weight, bias.as_ref(), [edge, edge], [0, 0], [1, 1], 1)?.f_to_kind(Kind::Float)
     }
 
-    /// `[N, h, w]`: 1 for tokens of which any cell is valid in the mask `[N, 1, H, W]`, a cell of which is one of `cells` by
-    /// `cells`.
+    /// `[N, h, w]`: 1 for tokens of which any cell is valid in the mask `[N, 1, H, W]`, whose cells are pooled from
+    /// `cells` by `cells`.
     fn valid(&self, mask: &Tensor, cells: i64) -> Result<Tensor, TchError> {
         let edge = self.patch / cells;
         let none: [i64; 2] = [0, 0];

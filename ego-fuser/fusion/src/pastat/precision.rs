@@ -1,10 +1,10 @@
-//! In which numbers convolutions compute where nothing is learnt.
+//! Precision of convolutions without gradients.
 
 use tch::{Device, Kind, TchError, Tensor, nn};
 
 use crate::f64_tensor::are_numbers;
 
-/// A convolution in the precision of `maps` and without a change of size; its parameters stay as they are.
+/// A size-preserving convolution in the precision of `maps`; its parameters are unchanged.
 pub(super) fn convolve(convolution: &nn::Conv2D, maps: &Tensor) -> Result<Tensor, TchError> {
     let weight = convolution.ws.f_to_kind(maps.kind())?;
     let bias = convolution.bs.as_ref().map(|bias| bias.f_to_kind(maps.kind())).transpose()?;
@@ -12,12 +12,12 @@ pub(super) fn convolve(convolution: &nn::Conv2D, maps: &Tensor) -> Result<Tensor
     maps.f_conv2d(&weight, bias.as_ref(), [1, 1], [around, around], [1, 1], 1)
 }
 
-/// The precision in which what is made of `maps` is fastest without being wrong; their own where a gradient flows.
+/// The fastest sufficient precision for the device of `maps`; their own where a gradient flows.
 pub(super) fn fastest_of(maps: &Tensor) -> Kind {
     if are_numbers(maps) { fastest(maps.device()) } else { maps.kind() }
 }
 
-/// The precision in which convolutions are fastest without being wrong.
+/// The fastest sufficient precision of convolutions.
 pub(super) fn fastest(device: Device) -> Kind {
     if device == Device::Cpu && multiplies_bfloat16() { Kind::BFloat16 } else { Kind::Float }
 }

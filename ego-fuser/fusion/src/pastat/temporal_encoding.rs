@@ -1,4 +1,4 @@
-//! TE, Temporal Encoding (Eq. 10-12), of the true age of a map.
+//! TE, Temporal Encoding (Eq. 10-12): encodes the true age of a map.
 
 use tch::{Device, Kind, TchError, Tensor, nn};
 
@@ -6,10 +6,10 @@ use super::confidence_embedding::Confidences;
 use super::config::{PastatConfig, Wavelengths};
 use super::spatial_alignment::AlignedTokens;
 
-/// Ages beyond this are no ages, seconds.
+/// Ages are clamped to this, seconds.
 const MAX_AGE_SECS: f64 = 10.0;
 
-/// Adds to the tokens of each map what is known of it.
+/// Adds the encodings of each map to its tokens.
 #[derive(Debug)]
 pub(super) struct TemporalEncoding {
     config: PastatConfig,
@@ -21,7 +21,7 @@ pub(super) struct TemporalEncoding {
 pub(super) struct Tokens {
     /// `[N, D, h, w]`: `z^(0)`, the ego's newest first.
     pub(super) values: Tensor,
-    /// `[N, h, w]`, 1 for tokens that count.
+    /// `[N, h, w]`, 1 for valid tokens.
     pub(super) valid: Tensor,
 }
 
@@ -31,7 +31,7 @@ impl TemporalEncoding {
         Self { config: config.clone(), device: path.device() }
     }
 
-    /// Eq. 10: `z^(0) = Flatten(F) + E_t`, with the part of the confidence (Eq. 7) and of how well FSA has found each map to fit.
+    /// Eq. 10: `z^(0) = Flatten(F) + E_t`, with the terms of the confidence (Eq. 7) and of the match quality from FSA.
     pub(super) fn encode(
         &self,
         aligned: AlignedTokens,
@@ -61,7 +61,7 @@ impl TemporalEncoding {
 /// Eq. 11 and 12: `E_t` of a map of this age, `D` values.
 ///
 /// The paper counts time steps from 1, the oldest, to T, the newest. A map between two steps lies between them: `t` is
-/// no slot but T less the age in steps, so a late message is not taken for a fresh one.
+/// not a slot but T less the age in steps, so a late message is not encoded as a fresh one.
 fn encoding(age_secs: f64, config: &PastatConfig, wavelengths: Wavelengths) -> Vec<f32> {
     let t = config.frames as f64 - age_secs.clamp(-MAX_AGE_SECS, MAX_AGE_SECS) / config.frame_secs;
     let dim = config.dim as f64;

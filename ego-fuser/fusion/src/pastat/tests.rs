@@ -26,7 +26,7 @@ impl Scene {
         let entries = agent.len() as i64;
         let fact = |(&agent, &age_secs): (&usize, &f64)| MapMetadata {
             agent,
-            // All stand where the ego does: where a map was made it is what it is on the ego's lattice.
+            // All senders are at the ego's pose: maps as received are equal to maps on the ego's grid.
             ego_from_cav: Pose::IDENTITY,
             confidence: 0.8,
             age_secs,
@@ -42,7 +42,7 @@ impl Scene {
         pastat.fuse(&self.aligned()).unwrap().map
     }
 
-    /// The newest of each agent, and the rest with larger cells, those of `lean`.
+    /// The newest of each agent, and the rest pooled, as in `lean`.
     fn aligned(&self) -> AlignedMaps {
         self.aligned_with_cells_of(2)
     }
@@ -76,7 +76,7 @@ impl Scene {
         }
     }
 
-    /// The same with these entries alone, in this order.
+    /// The same with these entries only, in this order.
     fn only(&self, entries: &[usize]) -> Self {
         let index: Vec<i64> = entries.iter().map(|&entry| entry as i64).collect();
         let index = Tensor::from_slice(&index);
@@ -88,13 +88,13 @@ impl Scene {
     }
 }
 
-/// Without the search, in which maps without a meaning fit anywhere.
+/// Without the search, in which random maps match anywhere.
 fn small() -> PastatConfig {
     let fsa = FsaConfig { alignment_search: None, ..FsaConfig::default() };
     PastatConfig { dim: 16, windows: vec![2, 4], fsa: Some(fsa), ..PastatConfig::lean(4) }
 }
 
-/// A module in which no weight is neutral any more, as after a training.
+/// A module without neutral weights, as after a training.
 fn trained(config: &PastatConfig) -> (VarStore, Pastat) {
     let variables = VarStore::new(Device::Cpu);
     let pastat = Pastat::new(&variables.root(), config).unwrap();
@@ -116,8 +116,8 @@ fn untrained_it_is_the_maximum_of_the_newest_maps() {
         let newest = scene.features.narrow(0, 0, 3).amax([0_i64].as_slice(), false);
         let fused = pastat.fuse(&scene.aligned_with_cells_of(config.earlier_cells)).unwrap().map;
         assert!(distance(&fused, &newest) < 1e-4);
-        let alone = Scene::new(&[0], &[0.0]);
-        assert!(distance(&alone.fused(&pastat), &alone.features.get(0)) < 1e-6);
+        let ego_only = Scene::new(&[0], &[0.0]);
+        assert!(distance(&ego_only.fused(&pastat), &ego_only.features.get(0)) < 1e-6);
     }
 }
 
@@ -135,7 +135,7 @@ fn masked_entries_change_nothing_also_after_training() {
         }
         assert!(distance(&scene.fused(&pastat), &fused) < 1e-4);
         assert!(distance(&scene.only(&[0, 2]).fused(&pastat), &fused) < 1e-4);
-        // One that reaches some cells only counts there alone.
+        // A map with some cells counts only there.
         let _ = scene.mask.get(1).narrow(2, 0, 4).fill_(1.0);
         let near = scene.fused(&pastat);
         let _ = scene.features.get(1).narrow(2, 8, 12).fill_(-5.0);
@@ -193,13 +193,13 @@ fn fine(pastat: &Pastat, maps: &AlignedMaps) -> FineMaps {
 }
 
 #[test]
-fn fsa_learns_a_shift_from_the_maps_alone() {
+fn fsa_learns_a_shift_from_the_maps_only() {
     tch::manual_seed(7);
     let variables = VarStore::new(Device::Cpu);
     let config = PastatConfig { patch: 1, earlier_cells: 1, ..small() };
     let pastat = Pastat::new(&variables.root(), &config).unwrap();
     let mut optimizer = perception::train::AdamW::new(&variables, perception::train::AdamWConfig::default());
-    // The neighbour shows what the ego shows, a cell beside it; what is wanted is one sharp map.
+    // The neighbour's map is the ego's shifted by a cell; the target is one sharp map.
     let mut error = |step: u64, train: bool| {
         let mut scene = Scene::new(&[0, 1], &[0.0, 0.0]);
         let cells = uniform(step, &[1, 4, 12, 20]).gt(0.9).to_kind(Kind::Float) * 3.0;
@@ -232,7 +232,7 @@ fn the_memory_takes_of_earlier_maps_where_they_show_something() {
     let _ = scene.mask.get(4).fill_(0.0);
     let without = scene.fused(&pastat);
     assert!(distance(&fused, &without) > 1e-3);
-    // What is masked is nowhere read.
+    // Masked values are never read.
     let _ = scene.features.get(4).fill_(9.0);
     assert!(distance(&scene.fused(&pastat), &without) < 1e-4);
     assert!(distance(&scene.only(&[0, 1, 2, 3]).fused(&pastat), &without) < 1e-4);

@@ -6,26 +6,26 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct PoseGraphConfig {
-    /// At most so many boxes of each agent, the surest.
+    /// Largest number of boxes of each agent, the most confident ones.
     pub max_boxes: usize,
-    /// Boxes below this score are not looked at.
+    /// Boxes below this score are ignored.
     pub min_score: f32,
-    /// Fewest objects that an agent must share with those that are aligned already; below, its pose stays.
+    /// Fewest objects that an agent must share with those that are aligned already; below, its pose is not corrected.
     pub min_shared: usize,
-    /// How far apart two boxes of one object may lie by the poses as they came, metres.
+    /// Largest distance between two boxes of one object at the uncorrected poses, metres.
     pub search_m: f64,
-    /// How much an agent may have to be turned, degrees.
+    /// Largest rotation of an agent, degrees.
     pub max_turn_deg: f64,
-    /// How far apart two boxes of one object may lie after the agent was moved, metres.
+    /// Largest distance between two boxes of one object after the correction, metres.
     pub fit_tolerance_m: f64,
-    /// Standard deviation of the centre of a sure box nearby, metres.
+    /// Standard deviation of the centre of a confident box nearby, metres.
     pub box_std_m: f64,
     /// The same of its heading, degrees.
     pub box_std_deg: f64,
-    /// An agent whose boxes would be moved by less than this on average stays where it was, metres: boxes are not as exact
-    /// as a good pose.
+    /// An agent whose boxes would be moved by less than this on average is not corrected, metres: boxes are less
+    /// accurate than a good pose.
     pub dead_zone_m: f64,
-    /// Standard deviation of the poses as they came, metres.
+    /// Standard deviation of the uncorrected poses, metres.
     pub pose_std_m: f64,
     /// The same of their heading, degrees.
     pub pose_std_deg: f64,

@@ -1,20 +1,20 @@
-//! Which boxes of an agent are which objects: the motion near its pose that most of them agree on.
+//! Consensus matching: assigns an agent's boxes to objects by the motion near its pose with the most inliers.
 
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 
 use super::config::PoseGraphConfig;
 use crate::planar_fit;
 
-/// Two boxes nearer than this fix no heading, metres.
+/// Two boxes nearer than this determine no heading, metres.
 const MIN_EDGE_M: f64 = 2.0;
-/// By how much the score of the best motion must exceed that of any other; every box counts up to one.
+/// Margin by which the score of the best motion must exceed that of any other; every box counts up to one.
 const MIN_LEAD: f64 = 0.5;
 
-/// A motion that boxes agree on.
+/// A motion with its inliers.
 pub(super) struct Consensus {
-    /// Takes points of the agent's frame to the ego's.
+    /// Transforms points of the agent's frame to the ego's.
     pub(super) motion: Isometry3<f64>,
-    /// Object and box.
+    /// Pairs of object and box.
     pub(super) matches: Vec<(usize, usize)>,
     /// One for every box that fits exactly, less for those that fit less, less for a motion far from the prior.
     pub(super) score: f64,
@@ -43,7 +43,7 @@ pub(super) fn consensus(
     })
 }
 
-/// Pairs of object and box that may be one by the pose as it came.
+/// Pairs of object and box that may match at the uncorrected pose.
 fn candidates(
     objects: &[Vector3<f64>],
     boxes: &[Vector3<f64>],
@@ -73,7 +73,7 @@ struct Scored {
 }
 
 impl Search<'_> {
-    /// What each two candidates would move the agent by, where that is within bounds and enough others agree.
+    /// Motion by each pair of candidates, where it is within bounds and has enough inliers.
     fn motions(&self) -> Vec<Scored> {
         let mut motions = Vec::new();
         for (index, &first) in self.candidates.iter().enumerate() {
@@ -108,7 +108,7 @@ impl Search<'_> {
         Some(Isometry3::from_parts(Translation3::from(middle - from), rotation))
     }
 
-    /// Candidates that a motion brings together, each box and each object once, the nearest first.
+    /// Candidates that a motion aligns, each box and each object once, the nearest first.
     fn matches(&self, motion: &Isometry3<f64>) -> Vec<(usize, usize)> {
         let mut near: Vec<(f64, usize, usize)> = (self.candidates.iter())
             .map(|&(object, index)| (self.apart(motion, object, index), object, index))
@@ -136,7 +136,7 @@ impl Search<'_> {
         matches.iter().map(fit).sum::<f64>() - off * off
     }
 
-    /// How far apart two motions leave the boxes, on average.
+    /// Mean distance between the boxes under two motions.
     fn off(&self, one: &Isometry3<f64>, other: &Isometry3<f64>) -> f64 {
         let sum: f64 = self.boxes.iter().map(|center| (moved(one, center) - moved(other, center)).norm()).sum();
         sum / self.boxes.len().max(1) as f64
@@ -146,7 +146,7 @@ impl Search<'_> {
         self.off(one, other) > 2.0 * self.config.fit_tolerance_m
     }
 
-    /// The best fit to what a motion brings together.
+    /// The best fit to the inliers of a motion.
     fn refined(&self, motion: Isometry3<f64>) -> Isometry3<f64> {
         let matches = self.matches(&motion);
         let pairs = matches.iter().map(|&(object, index)| (self.boxes[index], self.objects[object]));

@@ -1,13 +1,14 @@
-//! Poses corrected by what vehicles see in common: the agent-object pose graph of CoAlign (Lu et al., ICRA 2023).
+//! Pose graph of CoAlign (Lu et al., ICRA 2023): corrects poses by commonly observed objects.
 //!
-//! Agents and objects are nodes, every box is an edge between the agent that sees it and the object it is of, weighed by
-//! how exact the box is. The ego stands still; agents and objects move until the boxes fit best.
+//! Agents and objects are nodes, every box is an edge between the agent that detects it and its object, weighted by the
+//! accuracy of the box. The ego is fixed; agents and objects move until the boxes fit best.
 //!
-//! What differs from the published code: boxes are one object there when they lie within 1.5 m of each other, which an
-//! error of 2 m and a degree at 60 m defeats; here the matching may move an agent by as much as its pose may be wrong, and
-//! takes the motion that most boxes agree on ([`consensus`](self)). Its detector predicts the uncertainty of every box;
-//! ours does not, and it is taken from score and distance. Agents stay near their own poses by a weak prior, so that one
-//! with few boxes in common is not turned about by them; and corrections smaller than boxes are exact are left undone.
+//! Differences from the published code: there, boxes are one object when they lie within 1.5 m of each other, which
+//! fails with an error of 2 m and a degree at 60 m; here the matching may move an agent by as much as its pose may be
+//! wrong, and uses the motion with the most inliers ([`consensus`](self)). Its detector predicts the uncertainty of
+//! every box; this one does not, and the uncertainty is derived from score and distance. Agents stay near their own
+//! poses by a weak prior, so that few common boxes do not rotate an agent; and corrections below the accuracy of boxes
+//! are discarded.
 
 mod config;
 mod consensus;
@@ -20,28 +21,28 @@ pub use config::PoseGraphConfig;
 use consensus::consensus;
 use optimise::{Graph, Node, Observation};
 
-/// An agent with what it sees.
+/// An agent with its detections.
 #[derive(Debug, Clone, Copy)]
 pub struct Observer<'a> {
-    /// Its pose as it came, LiDAR frames.
+    /// Its uncorrected pose, LiDAR frames.
     pub ego_from_agent: Pose,
     /// Its boxes in the frame of its own LiDAR.
     pub boxes: &'a [Detection],
 }
 
-/// What became of an agent.
+/// Correction of an agent.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Corrected {
-    /// Its pose now; as it came where too little is shared.
+    /// Its corrected pose; uncorrected where too few objects are shared.
     pub ego_from_agent: Pose,
-    /// Objects that it shares with others; 0 where its pose was left as it was.
+    /// Number of objects that it shares with others; 0 where its pose was not corrected.
     pub shared: usize,
 }
 
-/// Distance at which a box is half as exact as nearby, metres.
+/// Distance at which a box is half as accurate as nearby, metres.
 const HALF_EXACT_M: f64 = 60.0;
 
-/// A box of an agent, seen from above.
+/// A box of an agent, in the plane.
 struct Seen {
     /// In the frame of the agent, height left out.
     center: Vector3<f64>,
@@ -56,16 +57,16 @@ impl Seen {
         let center = Vector3::new(x, y, 0.0);
         let heading_rad = found.box3d.heading_rad;
         let is_sound = center.norm() < 1e4 && heading_rad.is_finite() && found.score >= config.min_score;
-        let doubt = (1.0 + center.norm() / HALF_EXACT_M) / f64::from(found.score.clamp(0.1, 1.0)).sqrt();
-        let (std_m, std_rad) = (config.box_std_m * doubt, config.box_std_deg.to_radians() * doubt);
+        let scale = (1.0 + center.norm() / HALF_EXACT_M) / f64::from(found.score.clamp(0.1, 1.0)).sqrt();
+        let (std_m, std_rad) = (config.box_std_m * scale, config.box_std_deg.to_radians() * scale);
         is_sound.then_some(Self { center, heading_rad, std_m, std_rad })
     }
 }
 
 /// Corrects the poses of all agents relative to the first, the ego, whose pose stays.
 ///
-/// Agents join one after another, those first that share most with whoever has joined: an agent that shares nothing with
-/// the ego may still be placed by a third.
+/// Agents join one after another, those first that share most with the joined ones: an agent that shares nothing with
+/// the ego may still be aligned through a third.
 #[must_use]
 pub fn correct(agents: &[Observer<'_>], config: &PoseGraphConfig) -> Vec<Corrected> {
     let seen: Vec<Vec<Seen>> = agents.iter().map(|agent| sound_boxes(agent.boxes, config)).collect();
@@ -94,7 +95,7 @@ pub fn correct(agents: &[Observer<'_>], config: &PoseGraphConfig) -> Vec<Correct
     corrected
 }
 
-/// How far boxes lie from where they were, on average.
+/// Mean distance between the boxes before and after.
 fn moved_by(seen: &[Seen], before: &Isometry3<f64>, after: &Isometry3<f64>) -> f64 {
     let moved = |seen: &Seen| {
         let [old, new] = [before, after].map(|pose| pose.rotation * seen.center + pose.translation.vector);
@@ -109,7 +110,7 @@ fn sound_boxes(boxes: &[Detection], config: &PoseGraphConfig) -> Vec<Seen> {
     sorted.into_iter().filter_map(|found| Seen::new(found, config)).take(config.max_boxes).collect()
 }
 
-/// Place and heading alone.
+/// Planar position and heading.
 fn flattened(pose: &Pose) -> Isometry3<f64> {
     let [x, y, _] = pose.translation_m;
     planar(&Node { x_m: x, y_m: y, heading_rad: pose.yaw_rad() })
@@ -124,13 +125,13 @@ fn planar(node: &Node) -> Isometry3<f64> {
 struct Assembly {
     /// In the frame of the ego.
     objects: Vec<Node>,
-    /// Agents here are places in `joined`.
+    /// Agents here are indices into `joined`.
     observations: Vec<Observation>,
     joined: Vec<(usize, Isometry3<f64>)>,
 }
 
 impl Assembly {
-    /// Of those waiting, the place of the one that shares most with the objects so far, and how.
+    /// Of those waiting, the index of the one that shares most with the objects so far, and its matches.
     fn next(
         &self,
         waiting: &[usize],
@@ -147,7 +148,7 @@ impl Assembly {
         found.max_by(|(_, one), (_, other)| one.score.total_cmp(&other.score))
     }
 
-    /// `matches` are pairs of object and box; boxes without an object become one.
+    /// `matches` are pairs of object and box; boxes without an object create one.
     fn join(&mut self, agent: usize, ego_from_agent: &Isometry3<f64>, seen: &[Seen], matches: &[(usize, usize)]) {
         let node = self.joined.len();
         let heading = ego_from_agent.rotation.euler_angles().2;
@@ -168,7 +169,7 @@ impl Assembly {
         self.joined.push((agent, *ego_from_agent));
     }
 
-    /// Agent, pose and number of shared objects of all who joined but the ego.
+    /// Agent, pose and number of shared objects of all joined agents but the ego.
     fn solve(
         self,
         priors: &[Isometry3<f64>],
@@ -176,7 +177,7 @@ impl Assembly {
     ) -> impl Iterator<Item = (usize, Isometry3<f64>, usize)> {
         let mut viewers = vec![0usize; self.objects.len()];
         self.observations.iter().for_each(|observation| viewers[observation.object] += 1);
-        // An object that one agent alone sees says nothing of poses.
+        // An object seen by one agent only does not constrain poses.
         let shared: Vec<Observation> =
             self.observations.into_iter().filter(|observation| viewers[observation.object] > 1).collect();
         let node = |motion: &Isometry3<f64>| Node {

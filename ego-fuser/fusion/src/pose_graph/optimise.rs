@@ -1,4 +1,4 @@
-//! Levenberg-Marquardt on agents and objects in the plane; objects are eliminated, so that what is solved is as small as
+//! Levenberg-Marquardt on agents and objects in the plane; objects are eliminated, so the linear system has the size of
 //! the number of agents.
 
 use std::f64::consts::PI;
@@ -6,12 +6,12 @@ use std::f64::consts::PI;
 use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
 
 const MAX_ROUNDS: usize = 40;
-/// Rounds end when the cost falls by less than this share.
+/// Iterations end when the relative decrease of the cost is below this.
 const CONVERGED: f64 = 1e-9;
 /// Residuals beyond so many standard deviations count linearly (Huber).
 const HUBER: f64 = 2.5;
 
-/// A place and a heading.
+/// A planar position and heading.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Node {
     pub(super) x_m: f64,
@@ -25,7 +25,7 @@ impl Node {
     }
 }
 
-/// An object as an agent sees it.
+/// Observation of an object by an agent.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Observation {
     pub(super) agent: usize,
@@ -36,11 +36,11 @@ pub(super) struct Observation {
     pub(super) information: [f64; 3],
 }
 
-/// Agents, of whom the first stands still, and objects.
+/// Agents, of which the first is fixed, and objects.
 #[derive(Debug)]
 pub(super) struct Graph {
     pub(super) agents: Vec<Node>,
-    /// Where agents would be without any object.
+    /// Prior poses of the agents.
     pub(super) priors: Vec<Node>,
     /// Inverse variances of x, y and heading.
     pub(super) prior_information: [f64; 3],
@@ -171,7 +171,7 @@ impl Equations {
         let inverses: Option<Vec<Matrix3<f64>>> = (self.objects.iter())
             .map(|(block, _)| {
                 let damped = block + Matrix3::from_diagonal(&block.diagonal()) * damping;
-                // An object that nobody sees any more stays where it is.
+                // An object without observations stays where it is.
                 if block.trace() == 0.0 { Some(Matrix3::zeros()) } else { damped.try_inverse() }
             })
             .collect();

@@ -7,7 +7,7 @@ use rand_chacha::ChaCha8Rng;
 
 use super::*;
 
-/// A street with vehicles at least a length apart, some of which both see.
+/// A street with vehicles at least a length apart, some of which both agents detect.
 struct Scene {
     cars: Vec<Box3d>,
     rng: ChaCha8Rng,
@@ -28,7 +28,7 @@ impl Scene {
         Self { cars, rng }
     }
 
-    /// What an agent at `ego_from_agent` detects of `cars`, with the errors of a detector.
+    /// Detections of an agent at `ego_from_agent` of `cars`, with the errors of a detector.
     fn seen(&mut self, ego_from_agent: &Pose, cars: std::ops::Range<usize>, error_m: f64) -> Vec<Detection> {
         let agent_from_ego = ego_from_agent.isometry().inverse();
         let rng = &mut self.rng;
@@ -60,7 +60,7 @@ impl Scene {
     }
 }
 
-/// Mean distance between where two poses put the boxes.
+/// Mean distance between the boxes under two poses.
 fn off(one: &Pose, other: &Pose, boxes: &[Detection]) -> f64 {
     let apart = |found: &Detection| {
         let center = Point3::from(found.box3d.center_m);
@@ -78,14 +78,14 @@ fn injected_errors_shrink_by_what_is_shared() {
         let truth = scene.pose();
         // The ego sees the first of the cars, the neighbour the last; `shared` of them are seen by both.
         let (ego, neighbour) = (scene.seen(&Pose::IDENTITY, 0..8, 0.15), scene.seen(&truth, 8 - shared..12, 0.15));
-        let believed = scene.disturbed(&truth);
+        let reported = scene.disturbed(&truth);
         let agents = [
             Observer { ego_from_agent: Pose::IDENTITY, boxes: &ego },
-            Observer { ego_from_agent: believed, boxes: &neighbour },
+            Observer { ego_from_agent: reported, boxes: &neighbour },
         ];
         let corrected = correct(&agents, &PoseGraphConfig::default());
         assert_eq!(corrected[0], Corrected { ego_from_agent: Pose::IDENTITY, shared: 0 });
-        let (was, is) = (off(&believed, &truth, &neighbour), off(&corrected[1].ego_from_agent, &truth, &neighbour));
+        let (was, is) = (off(&reported, &truth, &neighbour), off(&corrected[1].ego_from_agent, &truth, &neighbour));
         before += was;
         after += is;
         worse += usize::from(is > was);
@@ -130,15 +130,15 @@ fn a_good_pose_is_not_spoilt_by_boxes() {
 fn with_too_little_in_common_poses_stay_bit_for_bit() {
     let mut scene = Scene::new(5, 12);
     let truth = scene.pose();
-    let believed = scene.disturbed(&truth);
+    let reported = scene.disturbed(&truth);
     for shared in 0..3 {
         let (ego, neighbour) = (scene.seen(&Pose::IDENTITY, 0..6, 0.1), scene.seen(&truth, 6 - shared..9, 0.1));
         let agents = [
             Observer { ego_from_agent: Pose::IDENTITY, boxes: &ego },
-            Observer { ego_from_agent: believed, boxes: &neighbour },
+            Observer { ego_from_agent: reported, boxes: &neighbour },
         ];
         let corrected = correct(&agents, &PoseGraphConfig::default());
-        assert_eq!(corrected[1], Corrected { ego_from_agent: believed, shared: 0 }, "{shared} shared");
+        assert_eq!(corrected[1], Corrected { ego_from_agent: reported, shared: 0 }, "{shared} shared");
     }
     assert!(correct(&[], &PoseGraphConfig::default()).is_empty());
 }
@@ -150,11 +150,11 @@ fn a_neighbour_beyond_the_egos_sight_is_placed_by_a_third() {
     let ego = scene.seen(&Pose::IDENTITY, 0..6, 0.05);
     let between = scene.seen(&truths[0], 1..11, 0.05);
     let beyond = scene.seen(&truths[1], 6..15, 0.05);
-    let believed = truths.map(|truth| scene.disturbed(&truth));
+    let reported = truths.map(|truth| scene.disturbed(&truth));
     let agents = [
         Observer { ego_from_agent: Pose::IDENTITY, boxes: &ego },
-        Observer { ego_from_agent: believed[1], boxes: &beyond },
-        Observer { ego_from_agent: believed[0], boxes: &between },
+        Observer { ego_from_agent: reported[1], boxes: &beyond },
+        Observer { ego_from_agent: reported[0], boxes: &between },
     ];
     let corrected = correct(&agents, &PoseGraphConfig::default());
     assert!(off(&corrected[2].ego_from_agent, &truths[0], &between) < 0.3);

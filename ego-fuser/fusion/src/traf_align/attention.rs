@@ -1,4 +1,4 @@
-//! Attention of every token to the points along its trajectory.
+//! Deformable attention of every token to the points along its trajectory.
 
 use tch::nn::{self, Init};
 use tch::{TchError, Tensor};
@@ -49,9 +49,9 @@ impl TrajectoryAttention {
         let query = query.f_reshape([agents, self.heads, per_head, 1, height, width])?;
         let scores = (query * keys).f_sum_dim_intlist([2i64].as_slice(), true, None)? / (per_head as f64).sqrt();
         let weights = scores.f_softmax(3, None)?;
-        let heard = (weights * values).f_sum_dim_intlist([3i64].as_slice(), false, None)?;
-        let heard = heard.f_reshape([agents, dim, height, width])?.f_permute([0, 2, 3, 1])?.f_contiguous()?;
-        let tokens = self.norm.forward(&(last + self.out.forward(&heard)?))?;
+        let attended = (weights * values).f_sum_dim_intlist([3i64].as_slice(), false, None)?;
+        let attended = attended.f_reshape([agents, dim, height, width])?.f_permute([0, 2, 3, 1])?.f_contiguous()?;
+        let tokens = self.norm.forward(&(last + self.out.forward(&attended)?))?;
         let [first, second] = &self.mlp;
         let tokens = self.mlp_norm.forward(&(&tokens + second.forward(&first.forward(&tokens)?.f_relu()?)?))?;
         tokens.f_permute([0, 3, 1, 2])

@@ -17,7 +17,7 @@ pub struct TrafAlignConfig {
     pub dim: i64,
     /// Heads of the attention.
     pub heads: i64,
-    /// Points that a token looks at: a square of so many along each edge, moved by offsets.
+    /// Edge of the square of points that a token attends to; each point is moved by an offset.
     pub kernel: i64,
     /// Layers of attention, all along the same points.
     pub layers: usize,

@@ -1,4 +1,4 @@
-//! The trajectory field, and the points along it.
+//! Trajectory field of TraF-Align, and the sampling points along it.
 
 use perception::layers::convolution::ConvLayer;
 use tch::nn::{self, Init};
@@ -9,7 +9,7 @@ use super::config::TrafAlignConfig;
 /// Channels of the U-Net: at full and at half resolution.
 const WIDTHS: [i64; 2] = [16, 32];
 
-/// Predicts where each token's object has been.
+/// Predicts earlier positions of each token's object.
 #[derive(Debug)]
 pub(super) struct Trajectories {
     inner: ConvLayer,
@@ -48,7 +48,7 @@ impl Trajectories {
         }
     }
 
-    /// Tokens `[A, D, h, w]`, both sizes even, to a sampling lattice `[A, K h, w, 2]`: x, y of every point of every
+    /// Tokens `[A, D, h, w]`, both sizes even, to sampling positions `[A, K h, w, 2]`: x, y of every point of every
     /// token, -1..1 over the extent of the map.
     pub(super) fn points(&self, tokens: &Tensor, train: bool) -> Result<Tensor, TchError> {
         let fine = self.inner.forward(tokens, train);

@@ -1,19 +1,20 @@
-//! TraF-Align (Song et al., CVPR 2025): attention along the ways that objects take from past maps to now.
+//! TraF-Align (Song et al., CVPR 2025): attention along the trajectories of objects from past maps to now.
 //!
-//! The maps of an agent, each told its age, become one sum over time. A small U-Net predicts a trajectory field of it, and
-//! from that a convolution says for every cell where to look: offsets of some points around it. Each cell then attends to
-//! what lies at its points, and so gathers what was left behind along an object's way. Agents are fused by the maximum.
+//! The maps of an agent, each with an encoding of its age, are summed over time. A small U-Net predicts a trajectory
+//! field from the sum, and a convolution predicts from that the offsets of some sampling points around every cell. Each
+//! cell then attends to the features at its points, and so gathers earlier features along an object's trajectory.
+//! Agents are fused by the maximum.
 //!
-//! What differs from the published code, and what it costs:
+//! Differences from the published code, and their cost:
 //!
-//! - Its field and its offsets have losses of their own, made from tracked objects, and points are rounded to cells. Here
-//!   the detection loss alone trains them, through points that are read between cells. They need longer to find a
-//!   motion, and nothing keeps them from looking elsewhere where that detects as well.
-//! - Its agents are concatenated and fused by a convolution over a fixed number of places; here by the maximum, its other
-//!   option, which knows no order and no number of agents.
-//! - Its output replaces the features. Here it is added to each agent's newest map and begins at zero, so that training
-//!   begins as [`MaxFusion`](super::MaxFusion) and an encoder that was trained before is of use at once.
-//! - Learnt position encodings over the lattice are left out: objects move alike everywhere.
+//! - Its field and its offsets have losses of their own, derived from tracked objects, and points are rounded to cells.
+//!   Here the detection loss trains them, through bilinear sampling. Learning a motion takes longer, and other points
+//!   are not penalised where they detect as well.
+//! - Its agents are concatenated and fused by a convolution over a fixed number of slots; here by the maximum, its
+//!   other option, which is invariant to order and number of agents.
+//! - Its output replaces the features. Here it is added to each agent's newest map and is zero at first, so that
+//!   training begins as [`MaxFusion`](super::MaxFusion) and a pretrained encoder is useful at once.
+//! - Learnt position encodings over the BEV grid are left out: objects move alike everywhere.
 //! - `lean` works on tokens of 2 x 2 cells.
 
 mod attention;
@@ -75,7 +76,7 @@ pub struct TrafAlign {
     decoder: Tensor,
 }
 
-/// Wavelengths of the encoding of ages, in steps: two to the power of 1 to so many.
+/// Wavelengths of the encoding of ages, in steps: powers of two from 2 to `2^WAVES`.
 const WAVES: i64 = 4;
 
 impl TrafAlign {
@@ -114,8 +115,8 @@ impl TrafAlign {
     fn over_time(&self, maps: &Tensor, mask: &Tensor, agents: &Agents, train: bool) -> Result<Tensor, TchError> {
         let patch = [self.config.patch; 2];
         let seen = mask.f_max_pool2d(patch, patch, [0, 0], [1, 1], false)?;
-        let told = self.ages(&agents.age_secs)?.f_unsqueeze(-1)?.f_unsqueeze(-1)?;
-        let tokens = (self.tokeniser.forward(maps, train) + told) * seen;
+        let ages = self.ages(&agents.age_secs)?.f_unsqueeze(-1)?.f_unsqueeze(-1)?;
+        let tokens = (self.tokeniser.forward(maps, train) + ages) * seen;
         let mut size = tokens.size();
         size[0] = agents.newest.len() as i64;
         let owner = Tensor::f_from_slice(&agents.owner)?.f_to_device(tokens.device())?;
@@ -124,7 +125,7 @@ impl TrafAlign {
 
     fn fuse_present(&self, maps: &Tensor, mask: &Tensor, agents: &Agents, train: bool) -> Result<Tensor, TchError> {
         let (_, _, height, width) = maps.size4()?;
-        // The U-Net halves the tokens once.
+        // The U-Net halves the resolution of the tokens once.
         let padded = |maps: &Tensor| Padding::to_multiples_of(2 * self.config.patch, maps);
         let (maps, mask) = (padded(maps)?, padded(mask)?);
         let mut tokens = self.over_time(&maps, &mask, agents, train)?;
@@ -141,9 +142,9 @@ impl TrafAlign {
     }
 }
 
-/// Which map is of whom.
+/// Assignment of maps to agents.
 struct Agents {
-    /// For each map the place of its agent, the ego being 0.
+    /// For each map the index of its agent, the ego being 0.
     owner: Vec<i64>,
     age_secs: Vec<f64>,
     /// For each agent its newest map.

@@ -48,15 +48,15 @@ fn history_changes_what_is_gathered_and_so_does_its_age() {
         no_grad(|| fuse(&network, &features.narrow(0, 0, count), &facts[..count as usize], false))
     };
     let difference = |one: &Tensor, other: &Tensor| (one - other).abs().max().double_value(&[]);
-    let (alone, with_history) = (fused(1, 0.0), fused(2, 0.1));
-    assert!(difference(&alone, &with_history) > 1e-3);
+    let (ego_only, with_history) = (fused(1, 0.0), fused(2, 0.1));
+    assert!(difference(&ego_only, &with_history) > 1e-3);
     assert!(difference(&with_history, &fused(2, 0.3)) > 1e-4);
 }
 
-/// An object that stands two cells farther with every frame is to be found where it is going to be: the newest map does
-/// not show it at all, the two before do.
+/// An object that moves two cells per frame is to be detected at its next position: it is missing in the newest map and
+/// present in the two before.
 #[test]
-fn it_learns_to_look_along_a_motion() {
+fn it_learns_to_attend_along_a_motion() {
     let (variables, network) = network();
     let mut optimizer = tch::nn::Adam::default().build(&variables, 5e-3).unwrap();
     let facts = facts(&[(0, 0.0), (0, 0.1), (0, 0.2)]);
@@ -77,8 +77,8 @@ fn it_learns_to_look_along_a_motion() {
     }
     let mean = |losses: &[f64]| losses.iter().sum::<f64>() / losses.len() as f64;
     let (first, last) = (mean(&losses[..10]), mean(&losses[280..]));
-    // Shown the newest map alone it stays at 0.82. The tensor library has one seed for all tests that run at a time, so
-    // weights differ from run to run: of 60 the slowest came to 0.43.
+    // With the newest map only, the loss stays at 0.82. The tensor library has one seed for all tests that run at a
+    // time, so weights differ from run to run: of 60 the slowest came to 0.43.
     assert!(last < 0.7 * first, "{first} to {last}");
     for (name, variable) in variables.variables() {
         if variable.requires_grad() {
@@ -87,5 +87,5 @@ fn it_learns_to_look_along_a_motion() {
         }
     }
     let moved = variables.variables()["trajectories.offsets.weight"].abs().max().double_value(&[]);
-    assert!(moved > 0.0, "offsets learn from the detection loss alone");
+    assert!(moved > 0.0, "offsets learn from the detection loss only");
 }

@@ -5,15 +5,15 @@ use tch::{TchError, Tensor};
 
 use crate::layers::{Linear, attend, dropout};
 
-/// Kinds of agents that have projections of their own: vehicles and infrastructure.
+/// Types of agents with separate projections: vehicles and infrastructure.
 pub const AGENT_TYPES: usize = 2;
-/// Cells that are computed at once outside of training, for all agents together.
+/// Cells that are computed at once outside training, for all agents together.
 const CHUNK: i64 = 512;
 
 /// Attention whose projections depend on the type of an agent, and whose scores and messages depend on the two types.
 ///
 /// `softmax_j(q_i W_att[i, j] k_j / sqrt(D)) v_j W_msg[i, j]`, head by head. The matrices of a relation are multiplied
-/// into those of keys and values before any cell is looked at: they are constant, and the cells are many.
+/// into those of keys and values once, since they are constant and the cells are many.
 #[derive(Debug)]
 pub struct AgentAttention {
     heads: i64,
@@ -21,14 +21,14 @@ pub struct AgentAttention {
     key: [Linear; AGENT_TYPES],
     value: [Linear; AGENT_TYPES],
     out: [Linear; AGENT_TYPES],
-    /// `[AGENT_TYPES^2, M, D, D]`, the asking type first.
+    /// `[AGENT_TYPES^2, M, D, D]`, the type of the query first.
     relation_att: Tensor,
     /// The same for messages.
     relation_msg: Tensor,
     dropout: f64,
 }
 
-/// What agents of one type ask of all: projections with the relations in them.
+/// Projections of one query type to all types of senders, with the relations multiplied in.
 struct Asked {
     query: (Tensor, Tensor),
     /// For each type of sender.
@@ -43,7 +43,7 @@ impl AgentAttention {
         let into = |name: &str| std::array::from_fn(|kind| Linear::new(&(path / name / kind), channels, inner, true));
         let relation = |name: &str| {
             let shape = [(AGENT_TYPES * AGENT_TYPES) as i64, heads, head_channels, head_channels];
-            // Near the identity: typed attention starts out as attention.
+            // Near the identity: typed attention starts as ordinary attention.
             let relation = path.var(name, &shape, Init::Randn { mean: 0.0, stdev: 0.02 });
             let identity = Tensor::eye(head_channels, (relation.kind(), relation.device()));
             let _ = tch::no_grad(|| relation.shallow_clone().g_add_(&identity));
@@ -61,11 +61,11 @@ impl AgentAttention {
         }
     }
 
-    /// What the first `queries` agents see of all.
+    /// Attention of the first `queries` agents to all.
     ///
     /// # Shapes
     /// - `x`: `[N, T, C]`, `T` cells
-    /// - `unseen`: `[N, T]`, 0 where a cell of an agent may be looked at and minus infinity where not; nothing: all may
+    /// - `unseen`: `[N, T]`, 0 where a cell of an agent is valid and minus infinity where not; absent: all are valid
     /// - `types`: `N` below [`AGENT_TYPES`]
     /// - returns: `[queries, T, C]`
     ///
@@ -107,7 +107,7 @@ impl AgentAttention {
         queries: usize,
         asked: &[(usize, Asked)],
     ) -> Result<Tensor, TchError> {
-        // [N, t] to [t, 1, 1, N]: what is added to the scores of all heads and all who ask.
+        // [N, t] to [t, 1, 1, N]: added to the scores of all heads and all queries.
         let bias =
             unseen.map(|unseen| unseen.f_transpose(0, 1)?.f_contiguous()?.f_view([-1, 1, 1, types.len() as i64]));
         let bias = bias.transpose()?;
@@ -133,7 +133,7 @@ impl AgentAttention {
         Tensor::f_stack(&answers, 0)
     }
 
-    /// `[Q, t, C]` asking `[N, t, C]`: `[t, Q, M * D]`.
+    /// `[Q, t, C]` as queries of `[N, t, C]`: `[t, Q, M * D]`.
     fn answer(
         &self,
         query: &Tensor,
@@ -145,7 +145,7 @@ impl AgentAttention {
         let inner = asked.query.1.size()[0];
         let first = types[0];
         if types.len() == 1 {
-            // Who is alone has nothing to weigh.
+            // With a single agent all weights are 1.
             let (weight, offset) = &asked.key_value[first];
             let (weight, offset) = (weight.f_narrow(0, inner, inner)?, offset.f_narrow(0, inner, inner)?);
             return x.f_linear(&weight, Some(&offset))?.f_transpose(0, 1);

@@ -1,4 +1,4 @@
-//! What a V2X-ViT encoder is built from.
+//! Configuration of a V2X-ViT encoder.
 
 use perception::model_config::ConfigError;
 use serde::{Deserialize, Serialize};
@@ -17,13 +17,13 @@ pub struct WindowConfig {
     pub head_channels: i64,
 }
 
-/// How the outputs of window attention of several sizes become one.
+/// Merge of the outputs of window attention of several sizes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Merge {
     /// Their mean.
     Naive,
-    /// Weighed channel by channel by what the whole map looks like.
+    /// Weighted mean; the weights per channel come from the mean over the map.
     SplitAttention,
 }
 
@@ -43,18 +43,18 @@ pub struct V2xVitConfig {
     pub agent_head_channels: i64,
     /// Window attention, one entry a size; the edges divide one another.
     pub windows: Vec<WindowConfig>,
-    /// How the sizes are merged.
+    /// Merge of the sizes.
     pub merge: Merge,
     /// Channels inside the feed-forward network.
     pub hidden: i64,
-    /// Whether the delay of an agent is added to its features.
+    /// True if the delay of an agent is encoded in its features.
     pub temporal_encoding: bool,
-    /// Share of values left out in training.
+    /// Share of values dropped in training.
     pub dropout: f64,
 }
 
 impl V2xVitConfig {
-    /// The published sizes, for maps of `channels` (256 there).
+    /// The published sizes, for feature maps of `channels` (256 there).
     #[must_use]
     pub fn full(channels: i64) -> Self {
         let window = |edge, heads| WindowConfig { edge, heads, head_channels: (channels / heads).max(1) };
@@ -72,8 +72,8 @@ impl V2xVitConfig {
         }
     }
 
-    /// For live traffic on two cores: two layers, heads as wide as the published ones, nothing left out
-    /// (drawing what to leave out costs as much as a layer norm and a projection).
+    /// For live traffic on two cores: two layers, heads as wide as the published ones, no dropout (drawing its mask
+    /// costs as much as a layer norm and a projection).
     #[must_use]
     pub fn lean(channels: i64) -> Self {
         let window = |edge, heads| WindowConfig { edge, heads, head_channels: (channels / heads).max(1) };
@@ -137,7 +137,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_cannot_be_built_is_named() {
+    fn invalid_settings_are_named() {
         assert!(V2xVitConfig::full(256).validate().is_ok());
         assert!(V2xVitConfig::lean(64).validate().is_ok());
         let message = |change: fn(&mut V2xVitConfig)| {

@@ -1,4 +1,4 @@
-//! The encoder: layers of agent attention, window attention and a feed-forward network, normalised first.
+//! Encoder of V2X-ViT: layers of agent attention, window attention and a feed-forward network, all pre-norm.
 
 use tch::nn;
 use tch::{TchError, Tensor};
@@ -10,7 +10,7 @@ use super::window_attention::WindowAttention;
 use crate::block_order::BlockOrder;
 use crate::layers::{FeedForward, LayerNorm};
 
-/// One pair of attentions, each added to what it started from.
+/// One pair of attentions, each with a residual.
 #[derive(Debug)]
 pub struct Block {
     agent_norm: LayerNorm,
@@ -44,7 +44,7 @@ impl Block {
         }
     }
 
-    /// Across the agents at every cell: `[N, T, C]` to what the first `queries` of them know then.
+    /// Across the agents at every cell: `[N, T, C]` to the output of the first `queries` of them.
     ///
     /// # Errors
     /// [`TchError`] when shapes do not fit.
@@ -123,20 +123,20 @@ impl Encoder {
         &self.layers
     }
 
-    /// What delays are encoded by; nothing where they are not.
+    /// Encoding of delays; absent where the configuration has none.
     #[must_use]
     pub fn temporal(&self) -> Option<&TemporalEncoding> {
         self.temporal.as_ref()
     }
 
-    /// What the ego, the first agent, knows in the end.
+    /// Output of the ego, the first agent.
     ///
-    /// The result is the ego's alone, so the last agent attention asks for the ego alone, and what follows it is computed
-    /// for no one else.
+    /// Only the ego's output is used, so the last agent attention has the ego as its only query, and later steps are
+    /// computed for the ego only.
     ///
     /// # Shapes
-    /// - `x`: `[N, T, C]` maps on the ego's lattice, delays encoded
-    /// - `unseen`, `types`: as [`AgentAttention::forward`] has them
+    /// - `x`: `[N, T, C]` maps on the ego's grid, delays encoded
+    /// - `unseen`, `types`: as in [`AgentAttention::forward`]
     /// - returns: `[T, C]`
     ///
     /// # Errors

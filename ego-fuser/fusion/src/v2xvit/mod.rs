@@ -1,7 +1,7 @@
 //! V2X-ViT: attention across agents at every cell and within windows of several sizes, in turn.
 //!
-//! Xu et al., ECCV 2022. What comes from the reference is the mathematics and the names of the parameters, so that its
-//! weights fit. Its spatial-temporal correction is the warp that all methods share here: maps come aligned for the time
+//! Xu et al., ECCV 2022. The mathematics and the names of the parameters are those of the reference, so that its
+//! weights fit. Its spatial-temporal correction is the warp that all methods share here: maps are aligned for the time
 //! of the ego's newest map. The delay is encoded by the true age rather than by the number of a step.
 
 mod agent_attention;

@@ -1,4 +1,4 @@
-//! What a delay adds to the features of a late agent.
+//! Temporal encoding of V2X-ViT: an additive encoding of an agent's delay.
 
 use tch::nn::{self, Init};
 use tch::{Kind, TchError, Tensor};
@@ -30,8 +30,8 @@ impl TemporalEncoding {
 
     /// The code of each delay, given in rows of the table: `N` of them to `[N, C]`.
     ///
-    /// Between rows it is interpolated, so that a true age need not be rounded to a step; beyond the table's ends they count
-    /// as its ends.
+    /// Between rows it is interpolated, so that a true age need not be rounded to a step; delays beyond the table's
+    /// ends are clamped.
     ///
     /// # Errors
     /// [`TchError`] of the tensor library.

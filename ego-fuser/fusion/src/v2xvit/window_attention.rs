@@ -1,4 +1,4 @@
-//! MSwin: attention within windows of several sizes, for every agent alone.
+//! MSwin: attention within windows of several sizes, for every agent separately.
 
 use tch::nn::{self, Init};
 use tch::{Kind, TchError, Tensor};
@@ -7,10 +7,10 @@ use super::config::{Merge, WindowConfig};
 use crate::block_order::BlockOrder;
 use crate::layers::{LayerNorm, Linear, attend, dropout};
 
-/// Tokens that are computed at once outside of training: what lies between two steps then stays in the cache.
+/// Tokens that are computed at once outside training: intermediate results then stay in the cache.
 const CHUNK: i64 = 1024;
 
-/// Attention within windows of one size, scores moved by the relative position.
+/// Attention within windows of one size, with a bias by relative position.
 #[derive(Debug)]
 pub struct WindowBranch {
     tokens: i64,
@@ -18,7 +18,7 @@ pub struct WindowBranch {
     to_qkv: Linear,
     /// `[2 * edge - 1, 2 * edge - 1]`, one for all heads.
     pos_embedding: Tensor,
-    /// `[tokens^2]` where in the flat `pos_embedding` the offset of each pair of tokens lies.
+    /// `[tokens^2]`: index of each pair's offset in the flat `pos_embedding`.
     offsets: Tensor,
     out: Linear,
 }
@@ -56,16 +56,16 @@ impl WindowBranch {
         attend(&parts[0], &parts[1], &parts[2], Some(bias))?.f_view([-1, self.heads * head_channels])
     }
 
-    /// What this branch gives alone: the tokens of one agent, `[T, C]` to the same.
+    /// Output of this branch: the tokens of one agent, `[T, C]` to the same.
     ///
     /// # Errors
-    /// [`TchError`] when they are no whole windows.
+    /// [`TchError`] when the tokens do not fill complete windows.
     pub fn forward(&self, x: &Tensor) -> Result<Tensor, TchError> {
         self.out.forward(&self.attend(x, &self.bias()?)?)
     }
 }
 
-/// The gate of a split-attention merge: how much of each branch goes into each channel.
+/// The gate of a split-attention merge: weight of each branch in each channel.
 #[derive(Debug)]
 struct Gate {
     fc1: Linear,
@@ -121,7 +121,7 @@ impl WindowAttention {
     /// The tokens of one agent, `[T, C]` in block order, to the same.
     ///
     /// # Errors
-    /// [`TchError`] when they are no whole windows.
+    /// [`TchError`] when the tokens do not fill complete windows.
     pub fn forward(&self, x: &Tensor, train: bool) -> Result<Tensor, TchError> {
         let tokens = x.size2()?.0;
         let chunk = if train { tokens } else { (CHUNK / self.largest).max(1) * self.largest };
@@ -139,8 +139,8 @@ impl WindowAttention {
 
     /// The last projections with the merge multiplied into them: `[inner, C]` for each branch, and one bias `[C]`.
     ///
-    /// Both merges weigh the branches' outputs channel by channel. Those outputs are linear in what the branches have seen,
-    /// so the weights go into the projection, and so does the mean over the map that the gate asks for.
+    /// Both merges weight the branches' outputs channel by channel. Those outputs are linear in the attention outputs,
+    /// so the weights go into the projection, and so does the mean over the map that the gate needs.
     fn merged(&self, seen: &[Vec<Tensor>], tokens: i64) -> Result<(Vec<Tensor>, Tensor), TchError> {
         let bias = |branch: &WindowBranch| branch.out.bias.as_ref().expect("the projection has a bias").shallow_clone();
         let biases = Tensor::f_stack(&self.branches.iter().map(bias).collect::<Vec<_>>(), 0)?;
@@ -171,7 +171,7 @@ impl WindowAttention {
 fn project(seen: &[Tensor], weights: &[Tensor], bias: &Tensor) -> Result<Tensor, TchError> {
     let mut sum = bias.f_addmm(&seen[0], &weights[0])?;
     for (seen, weight) in seen.iter().zip(weights).skip(1) {
-        // Nothing before this needs the sum again, so it can grow in place.
+        // The intermediate sum is not needed again, so it is accumulated in place.
         sum = sum.f_addmm_(seen, weight)?;
     }
     Ok(sum)

@@ -41,7 +41,7 @@ mod tests {
     use crate::warp::warp_to_ego;
 
     #[test]
-    fn on_a_centred_lattice_it_is_our_warp() {
+    fn on_a_centred_grid_it_equals_the_warp_of_this_module() {
         let grid = BevGrid { x_min_m: -8.0, y_min_m: -4.0, cell_m: 0.5, width: 32, height: 16 };
         let ego_from_cav = Pose::from_xyz_yaw([1.3, -0.6, 0.0], 0.4);
         let cav_from_ego = ego_from_cav.isometry().inverse().to_homogeneous();

@@ -1,8 +1,9 @@
-//! BEV features of a neighbour on the lattice of the ego.
+//! Warp: resamples a neighbour's BEV feature map onto the BEV grid of the ego.
 //!
-//! Only x, y and yaw of a pose enter: maps have no height. The public reference codes each have a convention of their
-//! own. [`opencood`] has those of OpenCOOD, for the tests that compare with it and for nothing else; [`coalign`] has that of
-//! CoAlign, for networks that fuse at every level. All other weights run on the warp of this module, whoever trained them.
+//! Only x, y and yaw of a pose are used: feature maps have no height. Each public reference code has its own
+//! convention. [`opencood`] has those of OpenCOOD, only for the tests that compare with it; [`coalign`] has that of
+//! CoAlign, for networks that fuse at every level. All other weights run on the warp of this module, wherever they were
+//! trained.
 
 pub mod coalign;
 pub mod opencood;
@@ -16,22 +17,22 @@ use crate::f64_tensor::{self, are_numbers, as_batch};
 
 /// `grid_sampler` reads zeros outside of the map.
 pub(crate) const PADDING_ZEROS: i64 = 0;
-/// `grid_sampler` weighs the four nearest cells.
+/// `grid_sampler` interpolates bilinearly between the four nearest cells.
 pub(crate) const BILINEAR: i64 = 0;
 /// `grid_sampler` takes the nearest cell.
 pub(crate) const NEAREST: i64 = 1;
 
-/// Why maps cannot be moved onto the ego lattice.
+/// Error of warping maps onto the ego's grid.
 #[derive(Debug, thiserror::Error)]
 pub enum WarpError {
-    /// The maps were not made for this lattice.
-    #[error("features of shape {found:?} do not lie on a lattice of {height} rows and {width} columns")]
+    /// The maps are not on this grid.
+    #[error("features of shape {found:?} are not on a grid of {height} rows and {width} columns")]
     Shape {
         /// Shape of the tensor.
         found: Vec<i64>,
-        /// Rows of the lattice.
+        /// Rows of the grid.
         height: u32,
-        /// Columns of the lattice.
+        /// Columns of the grid.
         width: u32,
     },
     /// Not one pose per map.
@@ -42,12 +43,12 @@ pub enum WarpError {
         /// Number of poses.
         poses: usize,
     },
-    /// The tensor library refused.
+    /// The tensor library reported an error.
     #[error("warp: {0}")]
     Torch(#[from] TchError),
 }
 
-/// Maps on the ego lattice.
+/// Feature maps on the ego's grid.
 #[derive(Debug)]
 pub struct WarpedMaps {
     /// `[N, C, H, W]`, zero wherever the mask is.
@@ -58,7 +59,7 @@ pub struct WarpedMaps {
 }
 
 impl WarpedMaps {
-    /// How many.
+    /// Number of maps.
     pub(crate) fn count(&self) -> Result<i64, TchError> {
         Ok(self.features.size4()?.0)
     }
@@ -70,10 +71,10 @@ impl WarpedMaps {
     }
 }
 
-/// Resamples BEV features of CAVs onto the ego lattice, bilinearly between cell centres.
+/// Resamples BEV features of CAVs onto the ego's grid, bilinearly between cell centres.
 ///
-/// Both maps lie on `grid`, each in the LiDAR frame of its vehicle. Where no transform moves anything (the ego itself),
-/// the features come back as they are, bit for bit.
+/// Both maps lie on `grid`, each in the LiDAR frame of its vehicle. At the identity transform (the ego itself) the
+/// features are returned unchanged, bit for bit.
 ///
 /// # Shapes
 /// - `features`: `[N, C, H, W]`; row grows with y, column with x
@@ -81,7 +82,8 @@ impl WarpedMaps {
 /// - `ego_from_cav`: N poses
 ///
 /// # Frames and units
-/// `ego_from_cav` takes points of the CAV's LiDAR frame to the ego's: metres, x forward, y left. x, y and yaw enter.
+/// `ego_from_cav` transforms points of the CAV's LiDAR frame to the ego's: metres, x forward, y left. x, y and yaw are
+/// used.
 ///
 /// # Errors
 /// [`WarpError`] when the features do not lie on `grid` or their number is not that of the poses.
@@ -94,7 +96,7 @@ pub fn warp_to_ego(
     warp_in_order(features, sent, ego_from_cav, grid, Order::Planes)
 }
 
-/// The same with the numbers of what is moved in some order, where no gradient flows.
+/// The same with a given memory order of the result, where no gradient flows.
 pub(crate) fn warp_in_order(
     features: &Tensor,
     sent: Option<&Tensor>,
@@ -144,7 +146,7 @@ pub(crate) fn warp_in_order(
     Ok(WarpedMaps { features, mask: Tensor::f_cat(&masks, 0)? })
 }
 
-/// Where an affine map of normalised coordinates puts the cells of a lattice, `[1, h, w, 2]` for `grid_sampler`.
+/// Positions of a grid's cells under an affine map of normalised coordinates, `[1, h, w, 2]` for `grid_sampler`.
 fn lattice(affine: [f32; 6], grid: &BevGrid) -> Result<Tensor, TchError> {
     let [rows, columns] = [grid.height, grid.width].map(|count| count as usize);
     let row = |row| (0..columns).flat_map(move |column| place_of([row, column], affine, grid));
@@ -159,14 +161,14 @@ fn place_of([row, column]: [usize; 2], [xx, xy, x0, yx, yy, y0]: [f32; 6], grid:
     [xx * x + xy * y + x0, yx * x + yy * y + y0]
 }
 
-/// Where some cells of the ego's lattice, by row and column, lie on a map of the same `grid`, in `grid_sampler`'s coordinates,
-/// two for each.
+/// Positions of some cells of the ego's grid, by row and column, on a map of the same `grid`, in `grid_sampler`'s
+/// coordinates, two for each.
 pub(crate) fn places_of(cells: &[[usize; 2]], ego_from_cav: &Pose, grid: &BevGrid) -> Vec<f32> {
     let affine = cav_from_ego_normalized(ego_from_cav, grid);
     cells.iter().flat_map(|&cell| place_of(cell, affine, grid)).collect()
 }
 
-/// Maps `[1, C, H, W]` as `[N, C, H, W]`, in the order that they have in memory.
+/// Maps `[1, C, H, W]` as `[N, C, H, W]`, in their memory order.
 fn one_after_another(maps: &[Tensor]) -> Result<Tensor, TchError> {
     if !maps.iter().all(are_numbers) {
         return Tensor::f_cat(maps, 0);
@@ -176,7 +178,7 @@ fn one_after_another(maps: &[Tensor]) -> Result<Tensor, TchError> {
     Tensor::f_cat(&cells, 0)?.f_permute([0, 3, 1, 2])
 }
 
-/// A map `[1, C, H, W]` and which of its cells were sent `[1, 1, H, W]`, read at `lattice` `[1, h, w, 2]`.
+/// A map `[1, C, H, W]` and the mask of its sent cells `[1, 1, H, W]`, sampled at `lattice` `[1, h, w, 2]`.
 fn read(map: &Tensor, sent: &Tensor, lattice: &Tensor, order: Order) -> Result<(Tensor, Tensor), TchError> {
     if !are_numbers(map) {
         return read_by_tensors(map, sent, lattice);
@@ -197,10 +199,10 @@ fn shape_error(found: Vec<i64>, grid: &BevGrid) -> WarpError {
     WarpError::Shape { found, height: grid.height, width: grid.width }
 }
 
-/// The affine map that moves nothing.
+/// The identity.
 const UNMOVED: [f32; 6] = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0];
 
-/// Rows of the affine map from normalised ego coordinates (-1..1 over the whole extent of the lattice, edges of the outer
+/// Rows of the affine map from normalised ego coordinates (-1..1 over the whole extent of the grid, edges of the outer
 /// cells included) to normalised CAV coordinates: `[xx, xy, x0, yx, yy, y0]`.
 pub fn cav_from_ego_normalized(ego_from_cav: &Pose, grid: &BevGrid) -> [f32; 6] {
     let (sin, cos) = ego_from_cav.yaw_rad().sin_cos();
@@ -250,7 +252,7 @@ mod tests {
 
     #[test]
     fn a_shift_of_whole_cells_moves_cells() {
-        // The CAV stands 2 m ahead of the ego: what it has at its own x, the ego has four columns on.
+        // The CAV is 2 m ahead of the ego: a feature at its own x is four columns further for the ego.
         let pose = Pose::from_xyz_yaw([2.0, -1.0, 0.3], 0.0);
         let warped = warp_to_ego(&one_hot(6, 10), None, &[pose], &GRID).unwrap();
         assert!((at(&warped.features, 4, 14) - 1.0).abs() < 1e-4);
@@ -295,7 +297,7 @@ mod tests {
             let (numbers, reached) = read(&map, &sent, &lattice, Order::Planes).unwrap();
             let (tensors, mask) = read_by_tensors(&map, &sent, &lattice).unwrap();
             prop_assert_eq!(numbers.size(), tensors.size());
-            // A place between two cells may be nearest to either.
+            // At a position between two cells either may be the nearest.
             let differ = (&reached - mask).abs();
             prop_assert!(differ.sum(Kind::Float).double_value(&[]) <= 2.0);
             let apart = (numbers - tensors).abs() * differ.eq(0.0);
@@ -328,7 +330,7 @@ mod tests {
     }
 
     #[test]
-    fn maps_of_another_lattice_are_refused() {
+    fn maps_of_another_grid_are_rejected() {
         let features = Tensor::zeros([1, 2, 16, 31], (Kind::Float, Device::Cpu));
         let error = warp_to_ego(&features, None, &[Pose::IDENTITY], &GRID).unwrap_err().to_string();
         assert!(error.contains("[1, 2, 16, 31]") && error.contains("16 rows and 32 columns"), "{error}");

@@ -1,13 +1,13 @@
 //! The warp of OpenCOOD and V2X-ViT: transforms in pixels, rotation about the pixel (W/2, H/2), corners aligned.
 //!
-//! Its matrices map source pixels to destination pixels. The rotation centre is kept as published, although the middle
+//! Its matrices map source pixels to destination pixels. The rotation centre is kept as published, although the centre
 //! of a map with aligned corners is ((W-1)/2, (H-1)/2); weights trained with it expect it.
 
 use tch::{Kind, TchError, Tensor};
 
 use super::{BILINEAR, NEAREST, PADDING_ZEROS};
 
-/// How values between cells are read.
+/// Interpolation between cells.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Interpolation {
     /// From the four nearest cells.
@@ -56,8 +56,8 @@ pub fn warp_affine(source: &Tensor, matrix: &Tensor, interpolation: Interpolatio
     source.f_grid_sampler(&lattice.f_to_kind(source.kind())?, mode, PADDING_ZEROS, true)
 }
 
-/// Destination-to-source matrices `[N, 2, 3]` on coordinates -1..1 with aligned corners, from source-to-destination pixel
-/// transforms `[N, 2, 3]`.
+/// Destination-to-source matrices `[N, 2, 3]` on coordinates -1..1 with aligned corners, from source-to-destination
+/// pixel transforms `[N, 2, 3]`.
 ///
 /// # Errors
 /// [`TchError`] when shapes do not fit or a transform cannot be inverted.
@@ -68,7 +68,7 @@ pub fn normalized(matrix: &Tensor, height: i64, width: i64) -> Result<Tensor, Tc
     destination_from_source.f_inverse()?.f_narrow(-2, 0, 2)
 }
 
-/// Which cells of the ego see something of each agent: `[B, L, H, W]`, 1 inside the warped extent of a present agent.
+/// Mask of the ego's cells that each agent covers: `[B, L, H, W]`, 1 inside the warped extent of a present agent.
 ///
 /// # Shapes
 /// - `correction`: `[B, L, 4, 4]` metric transforms

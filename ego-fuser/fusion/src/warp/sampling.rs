@@ -1,13 +1,13 @@
-//! Maps read between their cells, in numbers: what `grid_sampler` does with floats on the CPU where no gradient is wanted.
+//! Sampling: reads maps between their cells in plain floats, equal to `grid_sampler` on the CPU without gradients.
 //!
-//! The tensor library collects the four cells around a place anew for every channel. Here a map is transposed first, so that
-//! the channels of a cell lie together and are read in one go.
+//! The tensor library gathers the four cells around a position anew for every channel. Here a map is transposed first,
+//! so that the channels of a cell are contiguous and are read together.
 
 use tch::{TchError, Tensor};
 
 use crate::f64_tensor::{self, BLOCK, numbers};
 
-/// A map with the channels of each cell together.
+/// A map with the channels of each cell contiguous.
 #[derive(Debug)]
 pub(crate) struct Cells {
     /// `[height * width, channels]`.
@@ -17,7 +17,7 @@ pub(crate) struct Cells {
     width: usize,
 }
 
-/// How the numbers of what is read lie in memory; they are the same.
+/// Memory order of the result; the values are the same.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Order {
     /// A channel after another.
@@ -26,12 +26,12 @@ pub(crate) enum Order {
     Cells,
 }
 
-/// A place on a map: the four cells around it with their weights, which are zero beyond the edges.
+/// A position on a map: the four cells around it with their weights, which are zero beyond the edges.
 #[derive(Clone, Copy)]
 struct Place {
     cells: [usize; 4],
     weights: [f32; 4],
-    /// The nearest cell, where that is on the map.
+    /// The nearest cell, if it is on the map.
     nearest: Option<usize>,
 }
 
@@ -43,8 +43,8 @@ impl Cells {
         Ok(Self { values: f64_tensor::cells(map)?, channels, height, width })
     }
 
-    /// The map `[C, h, w]` read bilinearly at `lattice` `[h, w, 2]` (`grid_sampler`'s coordinates), and what is valid there
-    /// `[1, h, w]` by the nearest cell of `valid` `[H, W]`. Zeros beyond the edges, and where nothing is valid.
+    /// The map `[C, h, w]` sampled bilinearly at `lattice` `[h, w, 2]` (`grid_sampler`'s coordinates), and its validity
+    /// `[1, h, w]` by the nearest cell of `valid` `[H, W]`. Zeros beyond the edges, and where cells are invalid.
     pub(super) fn read(&self, valid: &Tensor, lattice: &Tensor, order: Order) -> Result<(Tensor, Tensor), TchError> {
         let (rows, columns, _) = lattice.size3()?;
         let (valid, lattice) = (numbers(valid)?, numbers(lattice)?);
@@ -69,11 +69,11 @@ impl Cells {
         Ok((read, Tensor::f_from_slice(&reached)?.f_view([1, rows, columns])?))
     }
 
-    /// Raises `strongest` `[h * w, C]` to what the map shows at `lattice` `[h, w, 2]`, times `shares` `[h, w]`, where
-    /// that is more, and where the nearest cell of `valid` `[H, W]` says that it shows something.
+    /// Raises `strongest` `[h * w, C]` to the map's values at `lattice` `[h, w, 2]`, times `shares` `[h, w]`, where
+    /// those are larger, and where the nearest cell of `valid` `[H, W]` is valid.
     pub(crate) fn raise(&self, strongest: &mut [f32], [valid, lattice, shares]: [&Tensor; 3]) -> Result<(), TchError> {
         let shares = numbers(shares)?;
-        self.look(&numbers(valid)?, &numbers(lattice)?, |cell, shown| {
+        self.for_each_valid(&numbers(valid)?, &numbers(lattice)?, |cell, shown| {
             let strongest = &mut strongest[cell * self.channels..][..self.channels];
             strongest.iter_mut().zip(shown).for_each(|(most, shown)| *most = most.max(shares[cell] * shown));
         });
@@ -85,10 +85,10 @@ impl Cells {
         self.channels
     }
 
-    /// Shows `see` what lies at each place of `lattice` (`grid_sampler`'s coordinates, two a place) where the nearest cell of
-    /// `valid` `[H, W]` says that the map shows something.
+    /// Calls `see` with the features at each position of `lattice` (`grid_sampler`'s coordinates, two per position)
+    /// where the nearest cell of `valid` `[H, W]` is valid.
     #[inline]
-    pub(crate) fn look(&self, valid: &[f32], lattice: &[f32], mut see: impl FnMut(usize, &[f32])) {
+    pub(crate) fn for_each_valid(&self, valid: &[f32], lattice: &[f32], mut see: impl FnMut(usize, &[f32])) {
         let mut shown = vec![0.0; self.channels];
         for (cell, at) in lattice.chunks_exact(2).enumerate() {
             if self.read_at([at[0], at[1]], valid, &mut shown) != 0.0 {
@@ -97,7 +97,7 @@ impl Cells {
         }
     }
 
-    /// The channels at a place, and what is valid there.
+    /// The channels at a position, and the validity there.
     #[inline]
     fn read_at(&self, at: [f32; 2], valid: &[f32], values: &mut [f32]) -> f32 {
         let place = self.place(at);
@@ -135,26 +135,26 @@ impl Cells {
     }
 }
 
-/// Cells from the first one's middle, of -1..1 over all `size` of them.
+/// Cells from the first one's centre, of -1..1 over all `size` of them.
 fn along(at: f32, size: usize) -> f32 {
     ((at + 1.0) * size as f32 - 1.0) / 2.0
 }
 
-/// The two cells that a place along one axis lies between.
+/// The two cells around a position along one axis.
 struct Pair {
     /// Those nearest to them on the map.
     places: [usize; 2],
     /// Zero for one that is not on it.
     weights: [f32; 2],
-    /// The nearer, where that is on the map; of two as near the even one.
+    /// The nearer, if it is on the map; of two at equal distance the even one.
     nearest: Option<usize>,
 }
 
 impl Pair {
     #[inline]
     fn around(at: f32, size: usize) -> Self {
-        // Without the processor's own rounding, which not every one has, a call for each would take most of the time.
-        // What is no number is a place beyond the edge, not the first cell.
+        // By hand, since the processor's own rounding is not available on every processor and a call per value would
+        // dominate. NaN is a position beyond the edge, not the first cell.
         let at = if at.is_nan() { f32::NEG_INFINITY } else { at };
         let truncated = at as i32;
         let first = truncated.saturating_sub(i32::from(truncated as f32 > at));

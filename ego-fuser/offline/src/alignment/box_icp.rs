@@ -1,4 +1,4 @@
-//! Iterative closest point on the centres of boxes, seen from above: the ICP of the paper's table.
+//! ICP on box centres, in the plane: the row "ICP" of the paper's table.
 
 use nalgebra::{Isometry3, Vector3};
 use protocol::Box3d;
@@ -8,13 +8,13 @@ use fusion::planar_fit;
 
 /// Fewest boxes of each vehicle.
 const MIN_BOXES: usize = 3;
-/// Most rounds.
+/// Largest number of iterations.
 const MAX_ROUNDS: usize = 100;
-/// Rounds end when no centre moves farther, metres.
+/// Iterations end when no centre moves farther, metres.
 const CONVERGED_M: f64 = 1e-4;
 
-/// Moves the neighbour's boxes onto the nearest of the ego's until they stand still, beginning at `start`. Knows no
-/// outliers and no doubt: whatever it ends in is its answer.
+/// Moves the neighbour's boxes onto the nearest of the ego's until convergence, beginning at `start`. Without outlier
+/// rejection or quality check: the last iterate is the result.
 ///
 /// # Errors
 /// [`NoAlignment::TooFewBoxes`].

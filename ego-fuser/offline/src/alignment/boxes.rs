@@ -8,7 +8,7 @@ use super::box_icp;
 use super::free_align::{self, FreeAlignConfig};
 use super::method::{AlignError, AlignmentMethod, AlignmentSpec, NotAligned, Vehicle};
 
-/// Nobody knows where it is: that is the point.
+/// No pose is known: these methods do not need one.
 const NO_POSE: PoseEstimate = PoseEstimate::NoPose { reason: NoPoseReason::NoSource, inlier_count: 0 };
 
 /// Matches the graphs of both vehicles' boxes.
@@ -37,7 +37,7 @@ impl AlignmentMethod for FreeAlign {
     }
 }
 
-/// Moves one vehicle's box centres onto the other's, from where both would stand at one place.
+/// Registers one vehicle's box centres to the other's, starting at the identity.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct BoxIcp;
 

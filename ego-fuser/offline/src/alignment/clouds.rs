@@ -1,4 +1,4 @@
-//! Alignment by sweeps: ICP of the neighbour's against the ego's.
+//! Alignment by sweeps: ICP of the neighbour's sweep against the ego's.
 
 use localization::registration::icp::{self, IcpConfig, IcpSource, IcpTarget};
 use nalgebra::Isometry3;
@@ -7,7 +7,7 @@ use protocol::{NoPoseReason, PointCloud, PoseEstimate};
 
 use super::method::{AlignError, AlignmentMethod, AlignmentSpec, NotAligned, Vehicle};
 
-/// Registers the neighbour's decimate sweep against the ego's own.
+/// Registers the neighbour's decimated sweep against the ego's own.
 #[derive(Debug, Clone)]
 pub struct CloudIcp {
     config: IcpConfig,
@@ -15,7 +15,7 @@ pub struct CloudIcp {
 }
 
 impl CloudIcp {
-    /// Begins as if both stood at one place, or (`starts_at_gnss`) where both receivers say they are.
+    /// Starts at the identity, or (`starts_at_gnss`) at the difference of both receivers' poses.
     #[must_use]
     pub fn spec(config: IcpConfig, starts_at_gnss: bool) -> AlignmentSpec {
         let name = if starts_at_gnss { "icp-gnss" } else { "icp" };
@@ -46,7 +46,7 @@ impl AlignmentMethod for CloudIcp {
             return Err(NotAligned::Message);
         };
         let start = self.start(&own.pose, &received.pose)?;
-        // The ego has its own sweep in full: flatter planes than from a decimate one.
+        // The ego has its own sweep at full density: flatter planes than from a decimated one.
         let target = IcpTarget::of_sweep(&ego.frame.points.xyzi, &self.config);
         let source = IcpSource::of_sweep(&received.points.xyzi, &self.config);
         Ok(icp::register(&source, &target, &start, &self.config)?.target_from_source)

@@ -1,13 +1,14 @@
-//! Alignment by what both vehicles see: the largest set of boxes with the same distances between them.
+//! FreeAlign: alignment by the largest common subgraph of both vehicles' boxes with equal distances.
 //!
 //! After FreeAlign (Lei et al., ICRA 2024): each vehicle's boxes are the nodes of a complete graph whose edges are the
-//! distances between box centres, which no motion changes; from pairs of anchors the common subgraph grows greedily; the
-//! largest one gives the motion. As in the code published with the paper, edges are plain distances. What differs:
+//! distances between box centres, which are invariant to motion; from pairs of anchors the common subgraph grows
+//! greedily; the largest one gives the motion. As in the code published with the paper, edges are plain distances.
+//! Differences:
 //!
-//! - that code's loader throws matches away that are far from the true pose. Here nothing knows a true pose: a match must
-//!   speak for itself, by its size, by boxes lying on the same side of the anchors (a mirror image has all the same
-//!   distances), and by no other motion explaining nearly as much ([`NoAlignment::Ambiguous`]);
-//! - the graph network that the paper scores edges with, and the search over time steps, are left out.
+//! - that code's loader discards matches that are far from the true pose. Here no true pose is available: a match must
+//!   be plausible by itself, by its size, by boxes lying on the same side of the anchors (a mirror image has all the
+//!   same distances), and by no other motion having nearly as many inliers ([`NoAlignment::Ambiguous`]);
+//! - the graph network that scores edges in the paper, and the search over time steps, are left out.
 
 use nalgebra::{Isometry3, Vector2, Vector3};
 use protocol::Box3d;
@@ -15,32 +16,33 @@ use serde::{Deserialize, Serialize};
 
 use fusion::planar_fit;
 
-/// Motions that are looked at again after the search, best first.
+/// Motions that are refined after the search, best first.
 const FINALISTS: usize = 8;
-/// Headings nearer than this, and places nearer than twice the tolerance of the fit, are one motion: radians.
+/// Motions whose headings differ by less than this, radians, and positions by less than twice the tolerance of the fit,
+/// are one.
 const SAME_HEADING_RAD: f64 = 0.1;
 
 /// Settings of the matching.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct FreeAlignConfig {
-    /// At most so many boxes of each vehicle, the first ones.
+    /// Largest number of boxes of each vehicle, the first ones.
     pub max_boxes: usize,
-    /// Edges shorter than this say little, metres.
+    /// Edges shorter than this are ignored as ambiguous, metres.
     pub min_edge_m: f64,
     /// Largest difference between the lengths of an edge in both graphs, metres.
     pub edge_tolerance_m: f64,
-    /// Largest distance between two boxes that are one, after alignment, metres.
+    /// Largest distance between two matched boxes after alignment, metres.
     pub fit_tolerance_m: f64,
     /// Fewest boxes in common. Three agree by chance in every other frame.
     pub min_matches: usize,
-    /// By how many boxes the best motion must be ahead of any other.
+    /// Number of boxes by which the best motion must lead any other.
     pub min_lead: usize,
 }
 
 impl Default for FreeAlignConfig {
-    /// Chosen on detections of 160 pairs of validation scenes: 61 % are right to 3 m and 3 % wrong. With edges to 0.5 m,
-    /// as in the published code, 42 % and 1 %; with three matches and a lead of one 66 % and 6 %.
+    /// Chosen on detections of 160 pairs of validation scenes: 61 % are right to 3 m and 3 % wrong. With edges to 0.5
+    /// m, as in the published code, 42 % and 1 %; with three matches and a lead of one 66 % and 6 %.
     fn default() -> Self {
         Self {
             max_boxes: 40,
@@ -53,49 +55,49 @@ impl Default for FreeAlignConfig {
     }
 }
 
-/// How a neighbour stands to the ego.
+/// Pose of a neighbour relative to the ego by boxes.
 #[derive(Debug, Clone, PartialEq)]
 pub struct BoxAlignment {
-    /// Takes points of the neighbour's frame to the ego's; without roll and pitch.
+    /// Transforms points of the neighbour's frame to the ego's; without roll and pitch.
     pub ego_from_neighbour: Isometry3<f64>,
-    /// Boxes in common: place in the ego's list, place in the neighbour's.
+    /// Boxes in common: index in the ego's list, index in the neighbour's.
     pub matches: Vec<(usize, usize)>,
     /// Root mean square of the horizontal distances between them, metres.
     pub rms_m: f64,
 }
 
-/// Why boxes give no alignment.
+/// Reason for which boxes give no alignment.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum NoAlignment {
-    /// One of the two sees too little.
+    /// One of the two has too few boxes.
     #[error("the ego has {ego} boxes and the neighbour {neighbour}, both need at least {required}")]
     TooFewBoxes {
         /// Boxes of the ego.
         ego: usize,
         /// Boxes of the neighbour.
         neighbour: usize,
-        /// What it takes.
+        /// Number of boxes that is required.
         required: usize,
     },
-    /// They have too little in common.
-    #[error("at most {found} boxes agree, at least {required} must")]
+    /// They have too few boxes in common.
+    #[error("at most {found} boxes are inliers, at least {required} must be")]
     TooFewMatches {
-        /// Largest number of boxes that agree.
+        /// Largest number of inliers.
         found: usize,
-        /// What it takes.
+        /// Number of inliers that is required.
         required: usize,
     },
-    /// Two motions explain about as much.
-    #[error("{matches} boxes agree on one motion and {rival} on another")]
+    /// Two motions have about as many inliers.
+    #[error("{matches} inliers of one motion and {rival} of another")]
     Ambiguous {
-        /// Boxes that agree on the best motion.
+        /// Inliers of the best motion.
         matches: usize,
-        /// Boxes that agree on another.
+        /// Inliers of another motion.
         rival: usize,
     },
 }
 
-/// Aligns two vehicles by their boxes, each in the frame of its own LiDAR, the surest first.
+/// Aligns two vehicles by their boxes, each in the frame of its own LiDAR, the most confident first.
 ///
 /// # Errors
 /// [`NoAlignment`] where the evidence is thin.
@@ -129,10 +131,10 @@ fn same_motion(a: &Isometry3<f64>, b: &Isometry3<f64>, tolerance_m: f64) -> bool
 
 /// Boxes and the distances between them.
 struct Graph {
-    /// Place of each node in the list that was given.
+    /// Index of each node in the given list.
     given: Vec<usize>,
     centres: Vec<Vector3<f64>>,
-    /// `[N, N]`, metres, seen from above.
+    /// `[N, N]`, metres, in the plane.
     edges: Vec<f64>,
 }
 
@@ -153,21 +155,21 @@ impl Graph {
         self.edges[a * self.len() + b]
     }
 
-    /// How far `node` lies to the left of the way from `a` to `b`, metres.
+    /// Distance of `node` to the left of the line from `a` to `b`, metres.
     fn left_of(&self, (a, b): (usize, usize), node: usize) -> f64 {
         let way: Vector2<f64> = (self.centres[b] - self.centres[a]).xy();
         way.perp(&(self.centres[node] - self.centres[a]).xy()) / way.norm()
     }
 }
 
-/// A node of the ego's graph and the one of the neighbour's that it may be.
+/// A node of the ego's graph and its candidate in the neighbour's.
 type Match = (usize, usize);
 
 struct Search<'a> {
     ego: &'a Graph,
     neighbour: &'a Graph,
     config: &'a FreeAlignConfig,
-    /// Most boxes that agreed so far.
+    /// Most inliers so far.
     largest: usize,
     /// Different motions, each with the most boxes that led to it.
     motions: Vec<(usize, Isometry3<f64>)>,
@@ -190,7 +192,7 @@ impl Search<'_> {
         }
     }
 
-    /// All matches whose edge to the anchor is as long in both graphs, best first.
+    /// All matches whose edge to the anchor has the same length in both graphs, best first.
     fn agreeing_with(&self, anchor: Match) -> Vec<(f64, Match)> {
         let mut found = Vec::new();
         for k in 0..self.ego.len() {
@@ -209,7 +211,7 @@ impl Search<'_> {
         found
     }
 
-    /// The anchors and, greedily, all that has the same distances to everything already in, on the same side.
+    /// The anchors and, greedily, all nodes with the same distances to every node of the subgraph, on the same side.
     fn grown(&self, first: Match, second: Match, candidates: &[(f64, Match)]) -> Vec<Match> {
         let tolerance = self.config.edge_tolerance_m;
         let mut matches = vec![first, second];
@@ -240,7 +242,7 @@ impl Search<'_> {
         planar_fit::fit(&matches.iter().map(|&(a, b)| (self.neighbour.centres[b], self.ego.centres[a])))
     }
 
-    /// The best motions, each with all boxes that it puts together, fitted to these.
+    /// The best motions, each with its inliers and fitted to these.
     fn finalists(mut self) -> Vec<BoxAlignment> {
         self.motions.sort_by_key(|(size, _)| std::cmp::Reverse(*size));
         self.motions.truncate(FINALISTS);
@@ -258,7 +260,7 @@ impl Search<'_> {
         Some(BoxAlignment { ego_from_neighbour: motion, matches, rms_m })
     }
 
-    /// Boxes that a motion puts together, one to one, nearest first.
+    /// Inliers of a motion, one to one, nearest first.
     fn together(&self, motion: &Isometry3<f64>) -> Vec<Match> {
         let all = (0..self.ego.len()).flat_map(|a| (0..self.neighbour.len()).map(move |b| (a, b)));
         let mut near: Vec<(f64, Match)> = all
@@ -299,7 +301,8 @@ mod tests {
         (0..count).map(|_| place()).collect()
     }
 
-    /// What two vehicles see of `shared` vehicles and of `others` each, in their own frames, shaken by up to `noise_m`.
+    /// Boxes that two vehicles detect of `shared` vehicles and of `others` each, in their own frames, with noise up to
+    /// `noise_m`.
     fn views(seed: u64, shared: usize, others: usize, noise_m: f64) -> (Isometry3<f64>, Vec<Box3d>, Vec<Box3d>) {
         let mut random = ChaCha8Rng::seed_from_u64(seed);
         let heading = random.random_range(-3.1..3.1);
@@ -331,7 +334,7 @@ mod tests {
     }
 
     #[test]
-    fn what_has_nothing_in_common_is_rarely_aligned() {
+    fn views_without_common_boxes_are_rarely_aligned() {
         let config = FreeAlignConfig { min_matches: 5, ..FreeAlignConfig::default() };
         let aligned = (0..60).filter(|seed| {
             let (_, ego, neighbour) = views(*seed, 0, 12, 0.0);
@@ -342,7 +345,7 @@ mod tests {
     }
 
     #[test]
-    fn too_few_boxes_are_said() {
+    fn too_few_boxes_are_reported() {
         let (_, ego, neighbour) = views(1, 3, 0, 0.0);
         let refused = NoAlignment::TooFewBoxes { ego: 3, neighbour: 3, required: 4 };
         assert_eq!(align(&ego, &neighbour, &FreeAlignConfig::default()), Err(refused));
@@ -370,7 +373,7 @@ mod tests {
         let row = |from: i32| boxes((from..from + 8).map(|k| Vector3::new(f64::from(k) * 6.0, 5.0, -1.0)));
         let found = align(&row(0), &row(-3), &FreeAlignConfig::default());
         assert!(matches!(found, Err(NoAlignment::Ambiguous { .. })), "{found:?}");
-        // And an arrangement that looks the same from behind.
+        // And an arrangement that is symmetric under a half turn.
         let cross = [[20.0, 4.0], [-20.0, -4.0], [12.0, -9.0], [-12.0, 9.0], [30.0, -17.0], [-30.0, 17.0]];
         let cross = boxes(cross.map(|[x, y]| Vector3::new(x, y, -1.0)));
         let found = align(&cross, &cross, &FreeAlignConfig::default());

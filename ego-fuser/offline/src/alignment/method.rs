@@ -11,24 +11,24 @@ use protocol::{Box3d, WireError};
 
 use super::free_align::NoAlignment;
 
-/// What a vehicle has to align with.
+/// Input of a vehicle for alignment.
 #[derive(Debug, Clone, Copy)]
 pub struct Vehicle<'a> {
-    /// Its frame. True poses in it are for those who measure, and for sources that are told to take them.
+    /// Its frame. The true poses in it are for evaluation, and for sources that are configured to use them.
     pub frame: &'a Frame,
-    /// Its boxes in the frame of its LiDAR, the surest first; empty where no method needs them.
+    /// Its boxes in the frame of its LiDAR, the most confident first; empty where no method needs them.
     pub boxes: &'a [Box3d],
 }
 
 /// A way to align two vehicles of one scene.
 pub trait AlignmentMethod {
-    /// The message of a vehicle, from what it alone has.
+    /// The message of a vehicle, from its own data only.
     ///
     /// # Errors
-    /// [`AlignError`] when the method cannot go on at all.
+    /// [`AlignError`] when the method cannot continue at all.
     fn prepare(&mut self, vehicle: &Vehicle<'_>) -> Result<Message, AlignError>;
 
-    /// `ego_from_neighbour`, both in the frames of their LiDARs, or why there is none.
+    /// `ego_from_neighbour`, both in the frames of their LiDARs, or the reason why there is none.
     fn align(&self, ego: &Vehicle<'_>, own: &Message, received: &Message) -> Result<Isometry3<f64>, NotAligned>;
 }
 
@@ -38,7 +38,7 @@ type Construct = Box<dyn Fn() -> Box<dyn AlignmentMethod>>;
 pub struct AlignmentSpec {
     /// Name in tables.
     pub name: String,
-    /// Whether it looks at [`Vehicle::boxes`].
+    /// True if it uses [`Vehicle::boxes`].
     pub needs_boxes: bool,
     construct: Construct,
 }
@@ -66,7 +66,7 @@ impl fmt::Debug for AlignmentSpec {
     }
 }
 
-/// Why a pair was not aligned.
+/// Reason why a pair was not aligned.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum NotAligned {
     /// One of the two has no pose.
@@ -101,7 +101,7 @@ impl NotAligned {
     }
 }
 
-/// Why a comparison ended early.
+/// Reason why a comparison ended early.
 #[derive(Debug, thiserror::Error)]
 pub enum AlignError {
     /// A pose source cannot be set up.
@@ -113,7 +113,7 @@ pub enum AlignError {
     /// A message cannot be encoded.
     #[error(transparent)]
     Wire(#[from] WireError),
-    /// The detector refused.
+    /// The detector reported an error.
     #[error(transparent)]
     Detector(#[from] perception::detector::DetectorError),
     /// A recording without true poses.
@@ -121,9 +121,9 @@ pub enum AlignError {
     NoTruth {
         /// The scenario.
         scenario: String,
-        /// The moment.
+        /// Stem of the frame's file.
         stem: String,
-        /// Whose pose is missing.
+        /// Agent without a true pose.
         cav: protocol::CavId,
     },
 }

@@ -1,17 +1,17 @@
-//! Ways to find out how a neighbour stands to the ego without GNSS, compared on the same pairs.
+//! Alignment without GNSS: methods that estimate a neighbour's pose relative to the ego, compared on the same pairs.
 //!
-//! Every vehicle prepares a message from what it alone has; the ego aligns with its own and the neighbour's message. The
-//! paper's table is made of such pairs: time, bytes on the air, and the share that is right to 3 m.
+//! Every vehicle prepares a message from its own data only; the ego aligns with its own and the neighbour's message.
+//! The paper's table is made of such pairs: time, transmitted bytes, and the share that is right to 3 m.
 //!
 //! - [`poses`]: each vehicle sends its own pose, from any [`localization::pose_source::PoseSource`];
-//! - [`clouds`]: the neighbour sends its (decimate) sweep, which is registered against the ego's by ICP;
+//! - [`clouds`]: the neighbour sends its (decimated) sweep, which is registered against the ego's by ICP;
 //! - [`free_align`], [`box_icp`]: it sends its boxes, which are matched with the ego's;
 //!
-//! `evaluate::alignment` runs them over scenes and counts.
+//! `evaluation::alignment` runs them over scenes and counts.
 //!
-//! What differs from the papers: `free_align` has no graph network and no look at true poses; ICP on points is ours
-//! (point to plane), the paper's row "ICP" moves box centres and is `box-icp` here; bytes are those of the real messages,
-//! not of bare numbers.
+//! Differences from the papers: `free_align` has no graph network and does not use true poses; ICP on points is an
+//! implementation of this project (point to plane), the paper's row "ICP" moves box centres and is `box-icp` here;
+//! bytes are those of the actual messages, not of bare numbers.
 
 pub mod box_icp;
 pub mod clouds;

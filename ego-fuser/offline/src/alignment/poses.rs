@@ -1,4 +1,4 @@
-//! The method of the paper: every vehicle finds its own pose, and poses are all that is exchanged.
+//! Alignment by poses, the method of the paper: every vehicle localises itself, and only poses are exchanged.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -11,12 +11,12 @@ use protocol::message::Message;
 
 use super::method::{AlignError, AlignmentMethod, AlignmentSpec, NotAligned, Vehicle};
 
-/// Which pose of the recording a source is shown as measured.
+/// Pose of the recording that a source gets as its measurement.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Measured {
-    /// The true one: for sources that add an error to it. Sources that look at sweeps do not look at it.
+    /// The true one: for sources that add an error to it. Sources that localise by sweeps ignore it.
     True,
-    /// What the GNSS and IMU filter believed.
+    /// Estimate of the GNSS and IMU filter.
     Gnss,
 }
 
@@ -26,7 +26,7 @@ type Build = dyn Fn() -> Result<Box<dyn PoseSource>, PoseSourceError>;
 pub struct Poses {
     build: Rc<Build>,
     measured: Measured,
-    /// A source for each vehicle: some remember where it was.
+    /// A source for each vehicle: some keep the previous pose.
     sources: BTreeMap<CavId, Box<dyn PoseSource>>,
 }
 

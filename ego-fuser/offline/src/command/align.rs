@@ -23,16 +23,16 @@ use support::progress;
 use super::scenarios;
 use support::cli::BadInput;
 
-/// Compares ways to align the ego and a neighbour: time per pair, bytes on the air, success.
+/// Compares methods to align the ego and a neighbour: time per pair, transmitted bytes, success.
 ///
-/// Pairs are the ego (each scenario's first agent) and every neighbour within 70 m, at every moment. A pair that is not
+/// Pairs are the ego (each scenario's first agent) and every neighbour within 70 m, at every tick. A pair that is not
 /// aligned counts as missed.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Arguments {
     /// Datasets, splits or scenarios with true poses.
     #[arg(long, required = true, num_args = 1.., value_name = "DIR")]
     data: Vec<PathBuf>,
-    /// Number that stored intensities are divided by [default: auto; `sim-replay inspect --help` says by what].
+    /// Number that stored intensities are divided by [default: auto; see `sim-replay inspect --help`].
     #[arg(long, value_name = "auto|1|255|NUMBER", default_value_t, hide_default_value = true)]
     intensity_scale: IntensityScale,
     /// Methods; none named: all but icp-map.
@@ -41,22 +41,22 @@ pub(crate) struct Arguments {
     /// One more method: the poses of a source, described as in a scenario file. May be repeated.
     #[arg(long, value_name = "NAME=FILE.yaml")]
     pose_source: Vec<NamedSource>,
-    /// Where boxes come from.
+    /// Source of boxes.
     #[arg(long, value_enum, default_value = "detected")]
     boxes: Boxes,
     /// Weights of the detector, for detected boxes.
     #[arg(long, value_name = "FILE")]
     weights: Option<PathBuf>,
-    /// Drives through the same town with true poses that the map of icp-map is made of.
+    /// Drives through the same town with true poses from which the map of icp-map is built.
     #[arg(long, num_args = 1.., value_name = "DIR")]
     map: Vec<PathBuf>,
-    /// Way between two sweeps on the map, metres.
+    /// Distance between two sweeps of the map, metres.
     #[arg(long, default_value_t = 5.0)]
     map_spacing: f64,
-    /// Only every so many moments of a scenario.
+    /// Use every N-th tick of a scenario.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
     every: u32,
-    /// At most so many moments of every scenario.
+    /// Largest number of ticks of every scenario.
     #[arg(long)]
     frames: Option<usize>,
     /// Torch threads.
@@ -70,26 +70,26 @@ pub(crate) struct Arguments {
 /// A built-in method.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum Method {
-    /// The difference of what both GNSS and IMU filters believe.
+    /// The difference of both vehicles' GNSS and IMU estimates.
     Gnss,
-    /// ICP of the neighbour's sweep against the ego's, as if both stood at one place.
+    /// ICP of the neighbour's sweep against the ego's, starting at the identity.
     Icp,
-    /// The same, beginning at the difference of both GNSS poses.
+    /// The same, starting at the difference of both GNSS poses.
     IcpGnss,
-    /// Each vehicle's sweep against a map (`--map`), beginning at its GNSS pose.
+    /// Each vehicle's sweep against a map (`--map`), starting at its GNSS pose.
     IcpMap,
-    /// ICP on box centres, from one place: the row "ICP" of the paper.
+    /// ICP on box centres, starting at the identity: the row "ICP" of the paper.
     BoxIcp,
     /// Graph matching of boxes.
     FreeAlign,
 }
 
-/// Where boxes come from.
+/// Source of boxes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum Boxes {
     /// The detector.
     Detected,
-    /// The annotations of what a vehicle has seen, as in the paper.
+    /// The annotations of the objects in a vehicle's view, as in the paper.
     Annotated,
 }
 
@@ -165,7 +165,7 @@ impl Arguments {
             return Ok(BoxSource::Annotated);
         }
         let Some(weights) = &self.weights else {
-            return Err(BadInput::new("detected boxes need --weights FILE; or say --boxes annotated").into());
+            return Err(BadInput::new("detected boxes need --weights FILE; or use --boxes annotated").into());
         };
         let detector = Detector::load(weights).map_err(BadInput::of)?;
         let cav = CavId::new("detector").context("a name")?;
@@ -190,7 +190,7 @@ fn from_source(source: &NamedSource) -> Result<AlignmentSpec> {
     let bad = |error: &dyn std::fmt::Display| BadInput::new(format!("{}: {error}", file.display()));
     let text = std::fs::read_to_string(file).map_err(|error| bad(&error))?;
     let config: PoseSourceConfig = serde_saphyr::from_str(&text).map_err(|error| bad(&error))?;
-    // Once in vain, so that a missing file is found before the first scene.
+    // Built once without use, so that a missing file is found before the first scene.
     config.build().map_err(|error| bad(&error))?;
     Ok(Poses::spec(name.clone(), Measured::True, move || config.build()))
 }

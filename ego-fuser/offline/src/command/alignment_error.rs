@@ -1,4 +1,4 @@
-//! `ego-fuser residual`: what a method's own alignment leaves of offsets.
+//! `ego-fuser residual`: the part of pose offsets that a method's own alignment leaves.
 
 use std::path::PathBuf;
 
@@ -12,16 +12,16 @@ use support::text_table::{Side, TextTable};
 use super::scenarios;
 use support::cli::BadInput;
 
-/// Put offsets on the true poses of neighbours and measure how much of them the method's own alignment takes away.
+/// Add offsets to the true poses of neighbours and measure the part that the method's own alignment corrects.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Arguments {
     /// Datasets, splits or scenarios; the first vehicle of each scenario is the ego.
     #[arg(long, required = true, num_args = 1.., value_name = "DIR")]
     data: Vec<PathBuf>,
-    /// Number that stored intensities are divided by [default: auto; `sim-replay inspect --help` says by what].
+    /// Number that stored intensities are divided by [default: auto; see `sim-replay inspect --help`].
     #[arg(long, value_name = "auto|1|255|NUMBER", default_value_t, hide_default_value = true)]
     intensity_scale: IntensityScale,
-    /// Weights of a method that aligns maps itself, as pastat does.
+    /// Weights of a method that aligns maps itself, such as pastat.
     #[arg(long, value_name = "FILE")]
     weights: PathBuf,
     /// Distances, metres.

@@ -22,19 +22,19 @@ use support::output;
 use support::progress;
 use training::average_precision::{Ordering, Scorer, THRESHOLDS};
 
-/// A data set with the protocol that it is judged by.
+/// A data set with its evaluation protocol.
 struct Data {
     protocol: EvaluationProtocol,
     scenarios: Vec<Scenario>,
 }
 
-/// Measures AP on datasets, with true poses, nothing late and nothing lost.
+/// Measures AP on datasets, with true poses, without delay and without loss.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Arguments {
     /// Datasets, splits or scenarios.
     #[arg(long, required = true, num_args = 1.., value_name = "DIR")]
     data: Vec<PathBuf>,
-    /// Number that stored intensities are divided by [default: auto; `sim-replay inspect --help` says by what].
+    /// Number that stored intensities are divided by [default: auto; see `sim-replay inspect --help`].
     #[arg(long, value_name = "auto|1|255|NUMBER", default_value_t, hide_default_value = true)]
     intensity_scale: IntensityScale,
     /// Weights of encoder and head.
@@ -43,7 +43,7 @@ pub(crate) struct Arguments {
     /// Methods, one after another; none named: that of the weights.
     #[arg(long, num_args = 1..)]
     method: Vec<Method>,
-    /// At most so many frames of every scenario.
+    /// Largest number of frames of every scenario.
     #[arg(long)]
     frames: Option<usize>,
     #[command(flatten)]
@@ -150,13 +150,13 @@ impl Arguments {
     }
 }
 
-/// What the network of a weights file is for, where the file says it.
+/// Kind of network in a weights file's metadata, if it has one.
 fn kind_of(weights: &Path) -> Result<Option<String>, BadInput> {
     let weights = Weights::load(weights).map_err(BadInput::of)?;
     Ok(weights.metadata(KIND_KEY).map(ToOwned::to_owned))
 }
 
-/// The numbers of one method over all data, and what was left out.
+/// Results of one method over all data, and the data that were left out.
 fn evaluate(
     config: &dyn Fn(&Data) -> EvaluateConfig,
     data: &[Data],
@@ -199,7 +199,7 @@ fn print_row(row: &serde_json::Value) -> std::io::Result<()> {
     ))
 }
 
-/// What the frames of one method add up to.
+/// Totals over the frames of one method.
 #[derive(Default)]
 struct Tally {
     scorer: Scorer,

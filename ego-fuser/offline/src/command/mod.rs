@@ -15,11 +15,11 @@ use support::cli::{BadInput, Outcome};
 /// Subcommands of `ego-fuser` that read data sets.
 #[derive(Debug, clap::Subcommand)]
 pub(crate) enum Command {
-    /// Compare ways to align two vehicles without GNSS.
+    /// Compare alignment methods of two vehicles without GNSS.
     Align(Box<align::Arguments>),
     /// Measure AP on recorded scenes.
     Eval(eval::Arguments),
-    /// Measure what a method's own alignment leaves of offsets that are put on true poses.
+    /// Measure the part of pose offsets that a method's own alignment leaves.
     Residual(alignment_error::Arguments),
     /// Train a method on scenes.
     Train(Box<train::Arguments>),
@@ -28,7 +28,7 @@ pub(crate) enum Command {
 impl Command {
     /// Carries out the subcommand.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
-        malloc_settings::ensure(&malloc_settings::KEPT_MEMORY).context("this program again")?;
+        malloc_settings::ensure(&malloc_settings::KEPT_MEMORY).context("restarting with malloc settings")?;
         match self {
             Self::Align(arguments) => arguments.run()?,
             Self::Eval(arguments) => return arguments.run(),

@@ -32,7 +32,7 @@ pub(crate) struct Arguments {
     /// Datasets to measure AP on; none: no validation.
     #[arg(long, num_args = 1.., value_name = "DIR")]
     validation: Vec<PathBuf>,
-    /// Number that stored intensities are divided by [default: auto; `sim-replay inspect --help` says by what].
+    /// Number that stored intensities are divided by [default: auto; see `sim-replay inspect --help`].
     #[arg(long, value_name = "auto|1|255|NUMBER", default_value_t, hide_default_value = true)]
     intensity_scale: IntensityScale,
     /// Method: none, early or one that exchanges feature maps; `ego-fuser methods` lists them.
@@ -53,65 +53,67 @@ pub(crate) struct Arguments {
     /// Weight decay.
     #[arg(long, default_value_t = 1e-2)]
     weight_decay: f64,
-    /// Anchors between the overlap thresholds count for nothing, rather than as background as in OpenCOOD.
+    /// Ignore anchors between the overlap thresholds, rather than count them as background as in OpenCOOD.
     #[arg(long)]
     ignore_unassigned: bool,
     /// Probability that a neighbour is missing from a sample.
     #[arg(long, default_value_t = 0.1)]
     drop_neighbour: f64,
-    /// Poses to align maps by, as `agent localize` wrote them, of all scenes in one table or several [default: true poses].
+    /// Poses to align maps by, as `agent localize` wrote them, of all scenes in one table or several [default: true
+    /// poses].
     #[arg(long, value_name = "FILE", num_args = 1..)]
     poses: Vec<PathBuf>,
-    /// Standard deviation of an error of x, y and z on top of the vehicles' poses, metres.
+    /// Standard deviation of an additional error of x, y and z of the vehicles' poses, metres.
     #[arg(long, default_value_t = 0.0)]
     position_noise: f64,
-    /// Standard deviation of an error of yaw on top of the vehicles' poses, degrees.
+    /// Standard deviation of an additional error of yaw of the vehicles' poses, degrees.
     #[arg(long, default_value_t = 0.0)]
     heading_noise: f64,
-    /// How the errors of a sample's vehicles and moments hang together.
+    /// Correlation of the errors of a sample's vehicles and time steps.
     #[arg(long, value_enum, default_value_t)]
     noise_mode: NoiseMode,
     /// Share of the samples with that error.
     #[arg(long, default_value_t = 1.0)]
     noise_share: f64,
-    /// Share of the samples in which one neighbour is 5 to 30 m from where it believes to be, and as sure of it as ever.
+    /// Share of the samples in which one neighbour is 5 to 30 m from its reported pose, and overconfident.
     #[arg(long, default_value_t = 0.0)]
     lost_share: f64,
-    /// Neighbours' maps are up to so much older than the ego's in training, milliseconds.
+    /// Largest delay of neighbours' maps relative to the ego's in training, milliseconds.
     #[arg(long, value_name = "MS", default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=5_000))]
     max_delay: u64,
-    /// Ticks between two time steps of a method with history at most; every sample draws its own number.
+    /// Largest number of ticks between two time steps of a method with history; every sample draws its own number.
     #[arg(long, default_value_t = 1)]
     gap: usize,
-    /// Time steps of every vehicle [default: what the method takes].
+    /// Time steps of every vehicle [default: that of the method].
     #[arg(long)]
     frames: Option<usize>,
     /// Parts of pastat to leave out.
     #[arg(long, value_enum, value_delimiter = ',')]
     without: Vec<Part>,
-    /// Weight of what teaches a fusion that corrects poses (pastat) the errors that were put on top of them.
+    /// Weight of the loss that trains a fusion with pose correction (pastat) to undo the additional errors.
     #[arg(long, default_value_t = 0.0)]
     alignment_weight: f64,
-    /// Leave the encoder of --init as it is and learn the fusion and the head alone: fast, as maps are computed once.
+    /// Freeze the encoder of --init and train the fusion and the head only: fast, as maps are computed once.
     #[arg(long, requires = "init")]
     freeze_encoder: bool,
-    /// Where such maps are kept.
+    /// Folder of such maps.
     #[arg(long, value_name = "DIR", default_value = "runs/maps")]
     maps: PathBuf,
-    /// Most gigabytes of them per set of data; sweeps beyond are encoded whenever they are needed.
+    /// Largest size of them per set of data, gigabytes; sweeps beyond are encoded whenever they are needed.
     #[arg(long, value_name = "GB", default_value_t = 8.0)]
     maps_limit: f64,
-    /// How exactly they are kept.
+    /// Numeric type of such maps.
     #[arg(long, value_enum, default_value_t = Exactness::F16)]
     maps_dtype: Exactness,
     /// Largest turn of a vehicle's frame in training, degrees.
     #[arg(long, default_value_t = 45.0)]
     turn: f64,
-    /// Of the protocol's options, `--max-agents` is of a sample [default: 5]; the order of average precision has no effect.
+    /// Of the protocol's options, `--max-agents` is of a sample [default: 5]; the order of average precision has no
+    /// effect.
     #[command(flatten)]
     protocol: ProtocolConfig,
-    /// Learn what an ego can find that nobody helps: samples of one vehicle, which is to find what its neighbours have annotated
-    /// as well [default for none: what itself has annotated].
+    /// Train for ego-only operation: samples of one vehicle, with its neighbours' annotations as additional targets
+    /// [default for none: its own annotations only].
     #[arg(long)]
     alone: bool,
     /// Steps between two validations and checkpoints.
@@ -129,7 +131,7 @@ fn parse_config(name: &str) -> Result<DetectorConfig, String> {
 }
 
 impl Arguments {
-    /// Trains and says what came of it.
+    /// Trains and reports the result.
     pub(crate) fn run(&self) -> Result<()> {
         let config = self.config()?;
         let mut bar = Progress(TrainingBar::of(config.run.length));
@@ -142,12 +144,12 @@ impl Arguments {
         Ok(())
     }
 
-    /// What is faster where a training from scratch was not meant.
+    /// Hint at a faster way where a training from scratch was not meant.
     fn hint(&self) -> Option<&'static str> {
-        // Merged points are encoded together, by an encoder that learns with the rest.
+        // Merged points are encoded together, by an encoder that is trained with the rest.
         (self.init.is_none() && self.method.exchange() != Exchange::Points).then_some(
-            "training from scratch, encoder and all; --init deploy/weights/lean-max.safetensors --freeze-encoder learns \
-             fusion and head alone, several times faster",
+            "training from scratch, including the encoder; --init deploy/weights/lean-max.safetensors --freeze-encoder \
+             trains fusion and head only, several times faster",
         )
     }
 
@@ -201,7 +203,7 @@ impl Arguments {
         })
     }
 
-    /// The poses that maps are aligned by.
+    /// The poses by which maps are aligned.
     fn poses(&self) -> Result<SamplePoses> {
         let read = |file: &PathBuf| PoseTable::read(file).map(Arc::new).map_err(BadInput::of);
         let is_noisy = self.position_noise != 0.0 || self.heading_noise != 0.0;
@@ -217,7 +219,7 @@ impl Arguments {
         Ok(poses)
     }
 
-    /// The fusion, where the command line changes it.
+    /// The fusion, if the command line changes it.
     fn fusion(&self) -> Result<Option<FusionConfig>> {
         if self.without.is_empty() && self.frames.is_none() {
             return Ok(None);
@@ -234,7 +236,7 @@ impl Arguments {
     }
 }
 
-/// Whose fault it is that a training has ended early: that of what it was told, where no model could be begun with.
+/// Cause of an early end of a training: the input, if the initial model could not be built.
 fn blamed(error: TrainError) -> anyhow::Error {
     match error {
         TrainError::Model(ModelError::Weights(_) | ModelError::Config(_) | ModelError::Method(_))
@@ -245,7 +247,7 @@ fn blamed(error: TrainError) -> anyhow::Error {
     }
 }
 
-/// How exactly maps are kept.
+/// Numeric type of stored maps.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 enum Exactness {
     /// 2 bytes a value, packed.
@@ -254,7 +256,7 @@ enum Exactness {
     I8,
 }
 
-/// Shows on standard error how it goes.
+/// Progress on standard error.
 struct Progress(TrainingBar);
 
 impl Observer for Progress {

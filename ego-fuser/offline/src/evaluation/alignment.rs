@@ -1,4 +1,5 @@
-//! Comparison of alignment methods over scenes: the ego, which is a scenario's first agent, with every neighbour in range, at every moment.
+//! Comparison of alignment methods over scenes: the ego, a scenario's first agent, with every neighbour in range, at
+//! every tick.
 
 pub mod table;
 
@@ -16,30 +17,30 @@ use protocol::{Box3d, HEADER_LEN, Stamp, wire};
 use crate::alignment::{AlignError, AlignmentMethod, AlignmentSpec, NotAligned, Vehicle};
 use ego_fuser::ego::Ego;
 
-/// Where boxes come from.
+/// Source of boxes.
 #[derive(Debug)]
 pub enum BoxSource {
     /// A vehicle's own detections.
     Detected(Box<Agent>),
-    /// The recording's annotations of what this vehicle has seen, as in the paper's table.
+    /// The recording's annotations of the objects in this vehicle's view, as in the paper's table.
     Annotated,
 }
 
-/// One method on one pair at one moment.
+/// One method on one pair at one tick.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PairOutcome {
-    /// Place of the method in the list that was compared.
+    /// Index of the method in the list that was compared.
     pub method: usize,
     /// Payload that the neighbour sends for it, metadata and body, bytes.
     pub bytes: u64,
-    /// Until the ego knows: what a vehicle prepares (both at the same time) and the alignment itself. Boxes are there
-    /// anyway: detecting them does not count.
+    /// Latency of the alignment: the preparation of a vehicle's message (both at the same time) and the alignment
+    /// itself. Boxes are available anyway: their detection does not count.
     pub time: Duration,
-    /// How far off it is, or why there is none.
+    /// Its error, or the reason why there is no alignment.
     pub result: Result<AlignmentError, NotAligned>,
 }
 
-/// How far an alignment is off.
+/// Error of an alignment.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AlignmentError {
     /// Metres, in three dimensions.
@@ -55,7 +56,7 @@ impl AlignmentError {
     }
 }
 
-/// Compares methods on the moments of a scenario that `ticks` names; tells of every pair as it is done.
+/// Compares methods on the ticks of a scenario in `ticks`; reports every pair when it is done.
 ///
 /// # Errors
 /// [`AlignError`] at the first frame that cannot be read or has no true pose.
@@ -87,7 +88,7 @@ fn true_pose(frame: &Frame, scenario: &Scenario, tick: usize) -> Result<Isometry
     })
 }
 
-/// All pairs of one moment; the ego comes first.
+/// All pairs of one tick; the ego comes first.
 fn moment(
     methods: &mut [Box<dyn AlignmentMethod>],
     mut box_source: Option<&mut BoxSource>,
@@ -125,7 +126,7 @@ fn moment(
     Ok(())
 }
 
-/// A vehicle's message, what it weighs and how long it took.
+/// A vehicle's message, its size and its preparation time.
 struct Prepared {
     message: Message,
     bytes: u64,
@@ -143,7 +144,7 @@ fn prepare(method: &mut dyn AlignmentMethod, vehicle: &Vehicle<'_>) -> Result<Pr
     Ok(Prepared { message, bytes: bytes as u64, time })
 }
 
-/// A vehicle's boxes in the frame of its LiDAR, the surest first.
+/// A vehicle's boxes in the frame of its LiDAR, the most confident first.
 fn boxes(source: &mut BoxSource, frame: &Frame, world_from_lidar: &Isometry3<f64>) -> Result<Vec<Box3d>, AlignError> {
     match source {
         BoxSource::Detected(agent) => {
@@ -156,7 +157,7 @@ fn boxes(source: &mut BoxSource, frame: &Frame, world_from_lidar: &Isometry3<f64
             let targets = frame.objects.iter().filter(|object| ClassSet::VEHICLES.contains(object.class));
             let mut found: Vec<Box3d> =
                 targets.map(|object| ground_truth::upright_box(object, &lidar_from_world)).collect();
-            // Nearest first: as good a guess as any of what is seen best.
+            // Nearest first, as an estimate of the best detected ones.
             let range = |found: &Box3d| found.center_m[0].hypot(found.center_m[1]);
             found.sort_by(|a, b| range(a).total_cmp(&range(b)));
             Ok(found)

@@ -1,4 +1,4 @@
-//! Why an evaluation ended early.
+//! Errors of an evaluation.
 
 use dataset::ReadError;
 use link::LinkError;
@@ -11,16 +11,16 @@ use super::stepped::RemoteError;
 use ego_fuser::ego::EgoError;
 use training::feature_store::FeatureStoreError;
 
-/// Why an evaluation ended early.
+/// Reason why an evaluation ended early.
 #[derive(Debug, thiserror::Error)]
 pub enum EvaluateError {
     /// The weights are not readable.
     #[error(transparent)]
     Weights(#[from] WeightsError),
-    /// The detector refused.
+    /// The detector reported an error.
     #[error(transparent)]
     Detector(#[from] DetectorError),
-    /// The ego refused.
+    /// The ego reported an error.
     #[error(transparent)]
     Ego(#[from] EgoError),
     /// A pose source cannot be set up.
@@ -35,22 +35,22 @@ pub enum EvaluateError {
     /// Kept maps cannot be read.
     #[error(transparent)]
     Maps(#[from] Box<FeatureStoreError>),
-    /// The emulated air cannot be made.
+    /// The link emulation cannot be built.
     #[error(transparent)]
     Link(#[from] LinkError),
     /// Vehicles in processes of their own do not answer.
     #[error(transparent)]
     Remote(#[from] Box<RemoteError>),
-    /// A computer of the fleet does not keep up with the scene.
+    /// The compute time of a process exceeds the period of the scene.
     #[error(
         "{what} takes {takes_ms} ms, but the scene has a frame every {period_ms} ms: choose a smaller time in `compute`"
     )]
     TooSlow {
-        /// What takes too long.
+        /// Process or step that takes too long.
         what: &'static str,
-        /// How long, milliseconds.
+        /// Its compute time, milliseconds.
         takes_ms: f64,
-        /// From frame to frame, milliseconds.
+        /// Period of frames, milliseconds.
         period_ms: f64,
     },
 }

@@ -25,10 +25,10 @@ impl Participant {
         self.agent.cav()
     }
 
-    /// What another participant published last, which an attack may repeat.
-    pub(super) fn overhear(&mut self, latest: Option<&Sent>) {
+    /// Passes on the last messages of another participant, which an attack may replay.
+    pub(super) fn capture(&mut self, latest: Option<&Sent>) {
         if let Some(attack) = &mut self.attack {
-            attack.overhear(latest.map(Sent::overheard).unwrap_or_default());
+            attack.overhear(latest.map(Sent::captured).unwrap_or_default());
         }
     }
 

@@ -1,4 +1,4 @@
-//! What a vehicle says of a frame, through the same messages as in a live run.
+//! Messages of a vehicle for a frame, encoded and decoded as in a live run.
 
 use agent::agent::AgentInput;
 use agent::attack::CapturedMessages;
@@ -12,7 +12,7 @@ use super::participant::Participant;
 use ego_fuser::ego::{Content, View};
 use fusion::method::Exchange;
 
-/// What a vehicle sends for one frame.
+/// Messages of a vehicle for one frame.
 #[derive(Debug)]
 pub(super) struct Sent {
     pub(super) cav: CavId,
@@ -21,47 +21,47 @@ pub(super) struct Sent {
     pub(super) content: Option<Content>,
     pub(super) payload_bytes: u64,
     pub(super) wire_bytes: u64,
-    /// Of these, the pose's own message.
+    /// Of these, the bytes of the pose message.
     pub(super) pose_bytes: u64,
-    /// Why a map is written as it is, where it had to keep within a limit.
+    /// Decision of the rate control, where a map had to keep within a limit.
     pub(super) rate: Option<RateChoice>,
 }
 
 impl Sent {
-    /// As the ego sees it; nothing where nothing was sent.
+    /// As received by the ego; absent where nothing was sent.
     pub(super) fn view(&self) -> Option<View> {
         let Self { cav, capture_nanos, pose, content, .. } = self;
         Some(View { cav: cav.clone(), pose: *pose, capture_nanos: *capture_nanos, content: content.clone()? })
     }
 
-    /// As the ego sees it; nothing where nothing was sent.
+    /// As received by the ego; absent where nothing was sent.
     pub(super) fn into_view(self) -> Option<ego_fuser::ego::View> {
         let Self { cav, capture_nanos, pose, content, .. } = self;
         Some(ego_fuser::ego::View { cav, pose, capture_nanos, content: content? })
     }
 
-    /// As a vehicle that repeats it hears it.
-    pub(super) fn overheard(&self) -> CapturedMessages {
-        let mut heard = CapturedMessages::default();
+    /// As captured by a vehicle that replays it.
+    pub(super) fn captured(&self) -> CapturedMessages {
+        let mut captured = CapturedMessages::default();
         match self.content.clone() {
-            Some(Content::Features(map)) => heard.features = Some(map.features),
-            Some(Content::Boxes(found)) => heard.detections = Some(found),
-            Some(Content::Points(points)) => heard.points = Some(points),
+            Some(Content::Features(map)) => captured.features = Some(map.features),
+            Some(Content::Boxes(found)) => captured.detections = Some(found),
+            Some(Content::Points(points)) => captured.points = Some(points),
             None => {}
         }
-        heard
+        captured
     }
 
     /// The same, with payload and wire bytes.
-    pub(super) fn heard(&self) -> Option<(View, (u64, u64))> {
+    pub(super) fn received(&self) -> Option<(View, (u64, u64))> {
         Some((self.view()?, (self.payload_bytes, self.wire_bytes)))
     }
 }
 
-/// What a vehicle sends for a frame: where it is and, with `exchange`, what it sees.
+/// Messages of a vehicle for a frame: its pose and, with `exchange`, its perception.
 ///
 /// # Errors
-/// [`EvaluateError`] when it cannot see, write or read its own message.
+/// [`EvaluateError`] when it cannot perceive, encode or decode its own message.
 pub(super) fn view(
     participant: &mut Participant,
     frame: &Frame,
@@ -112,7 +112,7 @@ pub(super) fn view(
     Ok(sent(Some(content), bytes - HEADER_LEN as u64, bytes + pose_bytes))
 }
 
-/// Encodes and decodes a message; its size on the wire.
+/// Encodes and decodes a message; returns its size on the wire too.
 fn through_the_wire<M: Payload>(stamp: &Stamp, message: M) -> Result<(M, u64), WireError> {
     let encoded = wire::encode(stamp, message)?;
     let bytes = encoded.pieces().iter().map(|piece| piece.len() as u64).sum();
@@ -120,7 +120,7 @@ fn through_the_wire<M: Payload>(stamp: &Stamp, message: M) -> Result<(M, u64), W
     Ok((message, bytes))
 }
 
-/// Who speaks for which sweep, at the moment of the sweep.
+/// Sender and capture time of a sweep's messages, stamped at the capture time.
 pub(super) fn stamp(cav: &CavId, capture_nanos: u64) -> Stamp {
     Stamp { cav: cav.clone(), epoch: 0, sequence: 0, capture_nanos, publish_nanos: capture_nanos }
 }

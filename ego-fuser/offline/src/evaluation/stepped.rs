@@ -1,8 +1,8 @@
-//! Virtual time: who computes how long is given, the emulated air decides when what arrives, and the ego fuses at each
-//! tick exactly what has arrived by its deadline.
+//! Simulation time: compute times are given, the link emulation determines arrivals, and the ego fuses at each tick
+//! exactly the messages that have arrived by its deadline.
 //!
-//! Nothing here looks at a clock, so the same inputs and seed give the same result on a busy and on an idle machine. The
-//! pipelines, the pairing and the air are those of the live processes.
+//! No wall clock is read, so the same inputs and seed give the same result on a busy and on an idle machine. The
+//! pipelines, the pairing and the link emulation are those of the live processes.
 
 mod compute;
 mod delayed_delivery;
@@ -34,55 +34,55 @@ use ego_fuser::ego::{Skipped, View};
 use ego_fuser::pairing::{Paired, Pairing, PairingConfig};
 use fusion::method::Exchange;
 
-/// A fleet in virtual time.
+/// Configuration of a fleet in simulation time.
 #[derive(Debug, Clone)]
 pub struct SteppedConfig {
-    /// The air between the neighbours and the ego.
+    /// The link between the neighbours and the ego.
     pub link: LinkConfig,
-    /// Where paths of traces in it start.
+    /// Base folder of the paths of traces in it.
     pub link_folder: PathBuf,
-    /// Same seed, same losses and delays. Every scenario has its own of it.
+    /// Seed of losses and delays. Every scenario derives its own from it.
     pub seed: u64,
-    /// The ego fuses what has arrived so long after its tick, nanoseconds.
+    /// Deadline of the ego after its tick, nanoseconds.
     pub deadline_nanos: u64,
-    /// Which messages belong together.
+    /// Pairing of messages with a frame.
     pub pairing: PairingConfig,
-    /// How long everyone computes.
+    /// Compute times of all processes.
     pub compute: ComputeTimes,
-    /// Who takes part.
+    /// Vehicles that take part.
     pub crew: AgentPool,
     /// Vehicles with settings of their own.
     pub vehicles: BTreeMap<CavId, VehicleConfig>,
-    /// Which ticks of a scenario; clipped to those there are.
+    /// Ticks of a scenario; clipped to the available ones.
     pub ticks: Range<usize>,
     /// A variant of the sweeps, see [`Scenario::lidar_variants`].
     pub lidar_variant: Option<String>,
 }
 
-/// Who takes part.
+/// Vehicles that take part.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum AgentPool {
-    /// The first so many vehicles of a scenario, or all where it has fewer; the first is the ego. What the others see
-    /// counts as there all the same, so that the truth does not depend on how many talk.
+    /// The first so many vehicles of a scenario, or all where it has fewer; the first is the ego. Annotations of the
+    /// others count all the same, so that the ground truth does not depend on the number of senders.
     First(usize),
-    /// These, the ego first; the others are not there at all.
+    /// These, the ego first; the others are ignored completely.
     Named(Vec<CavId>),
 }
 
 /// Settings of one vehicle.
 #[derive(Debug, Clone, PartialEq)]
 pub struct VehicleConfig {
-    /// Where its pose comes from.
+    /// Source of its pose.
     pub pose_source: PoseSourceConfig,
-    /// How it writes its maps.
+    /// Encoding of its maps.
     pub codec: CodecConfig,
-    /// What it fits them to. There is no queue to watch.
+    /// Its rate control. There is no queue to observe.
     pub rate: RateConfig,
-    /// What it lies about; absent: nothing.
+    /// Field that it falsifies; absent: none.
     pub lie: Option<Falsification>,
 }
 
-/// RunScope a scenario; `on_frame` may end it. Each frame's stamp says when the ego published it.
+/// Runs a scenario; `on_frame` may end it. Each frame's stamp has the time at which the ego published it.
 pub(super) fn run(
     evaluator: &mut Evaluator,
     config: &SteppedConfig,
@@ -104,13 +104,13 @@ pub(super) fn run(
 
 /// A vehicle that takes part.
 struct Member {
-    /// Its place among the scenario's.
+    /// Its index among the scenario's agents.
     place: usize,
     cav: CavId,
     pipeline: Pipeline,
 }
 
-/// Where a vehicle computes.
+/// Location of a vehicle's pipeline.
 enum Pipeline {
     Here(Box<Participant>, CodecConfig),
     /// In a process of its own.
@@ -134,17 +134,17 @@ struct Run<'a> {
     scenario: &'a Scenario,
     /// The ego first.
     crew: Vec<Member>,
-    /// Places of those that are only asked what there is.
+    /// Indices of the agents that only contribute annotations.
     observers: Vec<usize>,
-    /// The next tick to compute, and the one behind the last.
+    /// The next tick to compute, and the end of the range.
     next: usize,
     end: usize,
     computed: VecDeque<Computed>,
-    courier: DelayedDelivery,
+    delivery: DelayedDelivery,
     pairing: Pairing<Envelope>,
     /// When messages arrived, by vehicle: capture time and arrival.
     arrivals: BTreeMap<CavId, VecDeque<(u64, u64)>>,
-    /// When the ego has done with what it fuses.
+    /// Time at which the ego finishes its current fusion, nanoseconds.
     ego_free_nanos: u64,
 }
 
@@ -174,11 +174,11 @@ impl<'a> Run<'a> {
         let observers = (0..scenario.agents.len()).filter(is_witness).collect();
         let ticks = config.ticks.start.min(scenario.ticks.len())..config.ticks.end.min(scenario.ticks.len());
         let began_nanos = scenario.ticks.get(ticks.start).map_or(0, |tick| tick.capture_nanos);
-        let letters: Vec<u64> = scenario.name.bytes().map(u64::from).collect();
-        let air = LinkEmulator::new(config.link.clone(), &config.link_folder, derive_seed(config.seed, &letters))?;
+        let seed_words: Vec<u64> = scenario.name.bytes().map(u64::from).collect();
+        let link = LinkEmulator::new(config.link.clone(), &config.link_folder, derive_seed(config.seed, &seed_words))?;
         let ego = crew.first().map_or_else(|| scenario.agents[0].clone(), |ego| ego.cav.clone());
         Ok(Self {
-            courier: DelayedDelivery::new(air, &ego, began_nanos),
+            delivery: DelayedDelivery::new(link, &ego, began_nanos),
             evaluator,
             config,
             scenario,
@@ -193,7 +193,7 @@ impl<'a> Run<'a> {
         })
     }
 
-    /// Computes the sweeps of the next tick and hands what the neighbours send to the air.
+    /// Computes the sweeps of the next tick and hands the neighbours' messages to the link.
     fn compute(&mut self) -> Result<(), EvaluateError> {
         let tick = self.next;
         self.next += 1;
@@ -201,7 +201,7 @@ impl<'a> Run<'a> {
         let load = self.load_options();
         let places: Vec<usize> = self.crew.iter().map(|member| member.place).collect();
         let ego_place = places.first().copied();
-        // Without an exchange, neighbours have nothing to encode; where they are is still asked.
+        // Without an exchange, neighbours have nothing to encode; their poses are still needed.
         let is_needed = |place: usize| Some(place) == ego_place || method.exchange() != Exchange::Nothing;
         let is_here = self.evaluator.remote.is_none();
         let with_maps = |place| is_here && is_needed(place);
@@ -220,7 +220,7 @@ impl<'a> Run<'a> {
             } else if sent.content.is_some() && method.exchange() != Exchange::Nothing {
                 senders.push(sent.cav.clone());
                 let distance_m = distance_m(&frames[0], &frames[place]);
-                enqueue(&mut self.courier, &self.config.compute, tick, sent, distance_m);
+                enqueue(&mut self.delivery, &self.config.compute, tick, sent, distance_m);
             }
         }
         let blind = LoadOptions { points: false, ..load };
@@ -231,7 +231,7 @@ impl<'a> Run<'a> {
         Ok(())
     }
 
-    /// What everyone makes of the sweeps of a tick.
+    /// Messages of all vehicles for the sweeps of a tick.
     fn perceive(&mut self, sweeps: &[Sweep]) -> Result<Vec<Sent>, EvaluateError> {
         if let Some(remote) = &self.evaluator.remote {
             let frames: Vec<&Frame> = sweeps.iter().map(|sweep| &sweep.frame).collect();
@@ -244,7 +244,7 @@ impl<'a> Run<'a> {
             let exchange = is_needed.then(|| method.own_content());
             let Some(member) = self.crew.iter_mut().find(|member| member.place == *place) else { continue };
             if let Pipeline::Here(participant, codec) = &mut member.pipeline {
-                participant.overhear(all.last());
+                participant.capture(all.last());
                 all.push(view(participant, frame, map.as_ref(), exchange, codec)?);
             }
         }
@@ -257,7 +257,7 @@ impl<'a> Run<'a> {
         LoadOptions { points, lidar_variant: self.config.lidar_variant.clone(), ..LoadOptions::default() }
     }
 
-    /// Fuses a tick; nothing where the ego's sweep cannot be read.
+    /// Fuses a tick; `None` where the ego's sweep cannot be read.
     fn decide(&mut self, tick: usize) -> Result<Option<EvaluatedFrame>, EvaluateError> {
         let capture_nanos = self.scenario.ticks[tick].capture_nanos;
         let compute = self.config.compute;
@@ -266,7 +266,7 @@ impl<'a> Run<'a> {
         while self.next < self.end && self.scenario.ticks[self.next].capture_nanos <= closes_nanos {
             self.compute()?;
         }
-        for arrived in self.courier.until(closes_nanos) {
+        for arrived in self.delivery.until(closes_nanos) {
             self.take_in(arrived);
         }
         let computed = self.computed.pop_front().expect("a tick closes after it began");
@@ -275,7 +275,7 @@ impl<'a> Run<'a> {
         let done_nanos = decided_nanos.max(self.ego_free_nanos).saturating_add(compute.fuse_nanos());
         self.ego_free_nanos = done_nanos;
         let mut result = self.fuse(tick, &own, &senders)?;
-        // Measured times would be another every time.
+        // Measured times would differ in every run.
         let stage = |name: &str, nanos| StageTiming { stage: name.into(), nanos };
         result.stages = vec![
             stage("pose", compute.pose_nanos()),
@@ -289,21 +289,21 @@ impl<'a> Run<'a> {
         Ok(Some(EvaluatedFrame { tick, stamp, result, frames, poses, objects }))
     }
 
-    /// Lays a message where it waits for its tick.
+    /// Queues an arrived message for its tick.
     fn take_in(&mut self, arrived: Arrived) {
-        let Arrived { nanos, letter } = arrived;
-        let (cav, capture_nanos) = (letter.view.cav.clone(), letter.view.capture_nanos);
+        let Arrived { nanos, envelope } = arrived;
+        let (cav, capture_nanos) = (envelope.view.cav.clone(), envelope.view.capture_nanos);
         let arrivals = self.arrivals.entry(cav.clone()).or_default();
         arrivals.push_back((capture_nanos, nanos));
         if arrivals.len() > self.config.pairing.depth {
             arrivals.pop_front();
         }
-        if let Some(lost) = self.pairing.insert(&cav, capture_nanos, letter) {
-            self.courier.dropped(&lost.cav, lost.reason);
+        if let Some(lost) = self.pairing.insert(&cav, capture_nanos, envelope) {
+            self.delivery.dropped(&lost.cav, lost.reason);
         }
     }
 
-    /// When the last of the senders' messages of a tick had come; none where one is missing.
+    /// Arrival of the last of the senders' messages of a tick; `None` where one is missing.
     fn complete_nanos(&self, capture_nanos: u64, senders: &[CavId]) -> Option<u64> {
         if self.evaluator.ego.method().exchange() == Exchange::Nothing {
             return Some(capture_nanos);
@@ -328,13 +328,13 @@ impl<'a> Run<'a> {
         }
         let output = self.evaluator.ego.detect(own, &views)?;
         for lost in &dropped {
-            self.courier.dropped(&lost.cav, lost.reason);
+            self.delivery.dropped(&lost.cav, lost.reason);
         }
         for (index, view) in views.iter().enumerate().filter(|(index, _)| first_uses[*index]) {
             let left_out = output.skipped.iter().find(|(skipped, _)| *skipped == index);
             match left_out {
-                Some((_, Skipped::Unusable(reason))) => self.courier.dropped(&view.cav, *reason),
-                Some((_, Skipped::NotNeeded)) | None => self.courier.received(&view.cav),
+                Some((_, Skipped::Unusable(reason))) => self.delivery.dropped(&view.cav, *reason),
+                Some((_, Skipped::NotNeeded)) | None => self.delivery.received(&view.cav),
             }
         }
         let mut result = self.evaluator.report(tick - self.config.ticks.start, own, &views, &bytes, output);
@@ -347,24 +347,24 @@ impl<'a> Run<'a> {
         Ok(result)
     }
 
-    /// Closes the books: what is still on its way or waits for a tick that will not come is in flight.
+    /// Closes the accounting: messages still on the link or queued for a tick that will not come are in flight.
     fn close(&mut self) {
         for member in self.crew.iter().skip(1) {
             let cav = &member.cav;
             let waiting = self.pairing.forget(cav) as u64;
-            self.courier.close(cav, waiting);
+            self.delivery.close(cav, waiting);
         }
-        self.evaluator.ledger.merge(self.courier.ledger());
-        self.evaluator.sent_bytes += self.courier.sent_bytes();
+        self.evaluator.ledger.merge(self.delivery.ledger());
+        self.evaluator.sent_bytes += self.delivery.sent_bytes();
     }
 }
 
-/// Hands over what a neighbour sends for a tick: its pose as soon as it is known, the rest when it is computed.
-fn enqueue(courier: &mut DelayedDelivery, compute: &ComputeTimes, tick: usize, sent: Sent, distance_m: f64) {
+/// Hands over a neighbour's messages for a tick: its pose as soon as it is known, the rest when it is computed.
+fn enqueue(delivery: &mut DelayedDelivery, compute: &ComputeTimes, tick: usize, sent: Sent, distance_m: f64) {
     let sequence = tick as u64;
     let pose_nanos = sent.capture_nanos.saturating_add(compute.pose_nanos());
     let (cav, pose_bytes) = (sent.cav.clone(), sent.pose_bytes);
-    courier.post_pose(&cav, sequence, pose_bytes, pose_nanos, distance_m);
+    delivery.enqueue_pose(&cav, sequence, pose_bytes, pose_nanos, distance_m);
     let (payload_bytes, wire_bytes) = (sent.payload_bytes, sent.wire_bytes);
     let sent_nanos = sent.capture_nanos.saturating_add(compute.agent_nanos());
     let stream = match sent.content.as_ref().map(ego_fuser::ego::Content::exchange) {
@@ -373,15 +373,15 @@ fn enqueue(courier: &mut DelayedDelivery, compute: &ComputeTimes, tick: usize, s
         _ => Stream::Bev,
     };
     if let Some(RateChoice { reason, .. }) = sent.rate {
-        courier.adapted(&cav, stream, reason);
+        delivery.adapted(&cav, stream, reason);
     }
     if let Some(view) = sent.into_view() {
-        let letter = Envelope { view, payload_bytes, wire_bytes };
-        courier.enqueue(stream, sequence, wire_bytes - pose_bytes, sent_nanos, distance_m, letter);
+        let envelope = Envelope { view, payload_bytes, wire_bytes };
+        delivery.enqueue(stream, sequence, wire_bytes - pose_bytes, sent_nanos, distance_m, envelope);
     }
 }
 
-/// The places of those who take part, the ego first.
+/// Indices of the participants, the ego first.
 fn places(scenario: &Scenario, crew: &AgentPool) -> Vec<usize> {
     match crew {
         AgentPool::First(count) => (0..scenario.agents.len()).take(*count).collect(),
@@ -391,7 +391,7 @@ fn places(scenario: &Scenario, crew: &AgentPool) -> Vec<usize> {
     }
 }
 
-/// Between two vehicles, metres; 0 where the recording does not know.
+/// Distance between two vehicles, metres; 0 where the recording has no poses.
 fn distance_m(one: &Frame, other: &Frame) -> f64 {
     let place = |frame: &Frame| frame.world_from_lidar.map(|pose| pose.translation_m);
     match (place(one), place(other)) {

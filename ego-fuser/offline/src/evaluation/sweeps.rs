@@ -14,13 +14,13 @@ pub(super) struct Sweep {
     pub(super) place: usize,
     /// Pose, annotations and, where needed, points.
     pub(super) frame: Frame,
-    /// The map `[1, C, H, W]` that its encoder made before; absent where none are kept.
+    /// The map `[1, C, H, W]` that its encoder computed before; absent where none are stored.
     pub(super) map: Option<Tensor>,
 }
 
 impl Evaluator {
-    /// Reads what the agents at `places` have at a tick. Absent agents and frames that cannot be read are left out and
-    /// counted; `with_maps` says whose maps are needed.
+    /// Reads the frames of the agents at `places` at a tick. Absent agents and frames that cannot be read are left out
+    /// and counted; `with_maps` selects the agents whose maps are needed.
     pub(super) fn sweeps(
         &mut self,
         scenario: &Scenario,
@@ -42,18 +42,18 @@ impl Evaluator {
         Ok(sweeps)
     }
 
-    /// Adds to what was left out what was found when the data set was opened.
+    /// Adds the problems found when the data set was opened to the data that were left out.
     pub fn add_left_out_files(&mut self, problems: &[ReadError]) {
         self.left_out.add_files(problems);
     }
 
-    /// What was left out so far.
+    /// Data that were left out so far.
     #[must_use]
     pub fn left_out(&self) -> &LeftOut {
         &self.left_out
     }
 
-    /// The kept map of a sweep; none where none are kept or none is needed.
+    /// The stored map of a sweep; `None` where none are stored or none is needed.
     fn map_of(
         &mut self,
         scenario: &Scenario,

@@ -1,4 +1,4 @@
-//! The fusion of all levels.
+//! Fusion at all levels of the backbone.
 
 use perception::layers::agent_attention::attend_ego;
 use perception::layers::backbone::BevBackbone;
@@ -8,13 +8,13 @@ use tch::{TchError, Tensor};
 use fusion::warp::{cav_from_ego_normalized, coalign};
 use fusion::where2comm::Aggregation;
 
-/// Where the maps of a sample lie; the first is the ego's.
+/// Alignment of the maps of a sample; the first is the ego's.
 #[derive(Debug)]
 pub struct Placement {
     /// Number of agents.
     pub agents: i64,
     /// `[agents, 2, 3]`, from coordinates -1..1 of the ego's map to those of each agent's, outer edges at -1 and 1: the
-    /// same at every level. `None`: clouds were brought to the frame of the ego before they were encoded.
+    /// same at every level. `None`: clouds were transformed to the frame of the ego before they were encoded.
     pub theta: Option<Tensor>,
 }
 
@@ -30,18 +30,19 @@ impl Placement {
     }
 }
 
-/// How the levels are fused.
+/// Settings of the fusion of the levels.
 #[derive(Debug)]
 pub struct Levels<'a> {
     /// The agents of each sample, which follow each other along dimension 0 of the maps.
     pub samples: &'a [Placement],
-    /// How a cell's features become one; cells that have not come are zeros, as where these networks were trained.
+    /// Operation that fuses the features of a cell; cells that were not received are zeros, as in the training of these
+    /// networks.
     pub aggregation: Aggregation,
-    /// `[sum of agents, 1, h, w]`: what is sent of the first level's maps, and thereby of those below.
+    /// `[sum of agents, 1, h, w]`: mask of the sent cells of the first level's maps, and thereby of those below.
     pub sent: Option<&'a Tensor>,
 }
 
-/// RunScope a backbone on canvases `[sum of agents, C, H, W]` and fuses at each level: `[samples, sum of C_up, H', W']`.
+/// Runs a backbone on canvases `[sum of agents, C, H, W]` and fuses at each level: `[samples, sum of C_up, H', W']`.
 ///
 /// # Errors
 /// [`TchError`] when the samples do not add up to the canvases.
@@ -59,7 +60,7 @@ pub fn fuse_levels(backbone: &BevBackbone, canvas: &Tensor, levels: &Levels<'_>)
     Ok(backbone.upsampled(&fused, false))
 }
 
-/// A mask of another level, read between its cells.
+/// A mask of another level, interpolated between its cells.
 pub(super) fn resized(mask: &Tensor, size: [i64; 2]) -> Result<Tensor, TchError> {
     let (_, _, height, width) = mask.size4()?;
     if [height, width] == size {
@@ -92,7 +93,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn alone_it_is_the_backbone_and_wrong_counts_are_refused() {
+    fn ego_only_it_is_the_backbone_and_wrong_counts_are_rejected() {
         tch::set_num_threads(1);
         let config = DetectorConfig { lidar_range_m: [-6.4, -6.4, -3.0, 6.4, 6.4, 1.0], ..DetectorConfig::lean() };
         let variables = VarStore::new(Device::Cpu);

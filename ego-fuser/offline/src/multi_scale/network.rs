@@ -1,4 +1,4 @@
-//! A whole network from pillars to heads that fuses at every level.
+//! Multi-scale network: from pillars to heads, with fusion at every level.
 
 use std::path::Path;
 
@@ -19,30 +19,31 @@ use fusion::where2comm::{Aggregation, Communication, CommunicationConfig};
 /// Kind of the weights files of these networks.
 pub const MULTI_SCALE_KIND: &str = "multi_scale_detector";
 
-/// Who leaves cells out, where agents choose what to send.
+/// Agents that leave cells out, where agents select cells.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Senders {
     /// All but the ego, as in OpenCOOD.
     #[default]
     Neighbours,
-    /// Every second agent of a sample, the first being the ego: as in Where2comm's own code, which was written for pairs.
+    /// Every second agent of a sample, the first being the ego: as in Where2comm's own code, which was written for
+    /// pairs.
     EverySecond,
 }
 
-/// What a network has beside its detector, stored as JSON beside its weights.
+/// Configuration of a network besides its detector, stored as JSON beside its weights.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct MultiScaleConfig {
-    /// How a cell's features become one.
+    /// Operation that fuses the features of a cell.
     pub aggregation: Aggregation,
-    /// Which cells agents send; absent: all.
+    /// Selection of the cells that agents send; absent: all.
     #[serde(default)]
     pub communication: Option<CommunicationConfig>,
-    /// Who leaves cells out.
+    /// Agents that leave cells out.
     #[serde(default)]
     pub senders: Senders,
-    /// Whether it was trained on clouds brought to the frame of the ego, so that maps are not moved.
+    /// True if it was trained on clouds in the frame of the ego, so that maps are not warped.
     #[serde(default)]
     pub one_frame: bool,
 }
@@ -57,20 +58,20 @@ pub struct MultiScaleNetwork {
     communication: Option<Communication>,
 }
 
-/// What a network says of samples.
+/// Output of a network for samples.
 #[derive(Debug)]
 pub struct MultiScaleOutput {
     /// Scores and offsets, `[samples, ...]`.
     pub heads: HeadOutput,
     /// Share of their cells that agents send, the ego's own counted as if it sent; 1 where all do.
     pub rate: f64,
-    /// What each agent has to send, bytes: the map of its first level in `f32`, from which the others follow; where it leaves
-    /// cells out, those that it sends and a mask of them.
+    /// Bytes that each agent has to send: the map of its first level in `f32`, from which the others follow; where it
+    /// leaves cells out, those that it sends and a mask of them.
     pub sent_bytes: Vec<u64>,
 }
 
 impl MultiScaleNetwork {
-    /// A network with random parameters: those of [`PointPillars`] and, where agents choose what to send,
+    /// A network with random parameters: those of [`PointPillars`] and, where agents select cells,
     /// `fusion_net.naive_communication.*`.
     ///
     /// # Errors
@@ -106,7 +107,7 @@ impl MultiScaleNetwork {
         &self.network
     }
 
-    /// What it has beside its detector.
+    /// Its configuration besides the detector.
     #[must_use]
     pub fn config(&self) -> &MultiScaleConfig {
         &self.config
@@ -156,7 +157,7 @@ impl MultiScaleNetwork {
         Ok(selected.into_iter().map(|selected| bytes(selected.unsigned_abs())).collect())
     }
 
-    /// The masks with those at one everywhere who send all.
+    /// The masks with ones everywhere for agents that send all cells.
     fn without_the_exempt(&self, masks: &Tensor, samples: &[Placement]) -> Result<Tensor, TchError> {
         let sends_all = samples.iter().flat_map(|sample| {
             (0..sample.agents).map(|agent| match self.config.senders {

@@ -60,11 +60,11 @@ impl OfflineDetector {
         rule_for(&self.network.network().config)
     }
 
-    /// Detections in the frame of the first vehicle, and what each of the others that took part had to send, bytes: those
-    /// with a pose, in reach.
+    /// Detections in the frame of the first vehicle, and the bytes that each of the others that took part had to send:
+    /// those with a pose, in range.
     ///
     /// # Errors
-    /// [`ModelError`] when the tensor library refuses.
+    /// [`ModelError`] when the tensor library reports an error.
     pub fn detect(&mut self, frames: &[Frame]) -> Result<(Vec<Detection>, Vec<u64>), ModelError> {
         let Some((ego, others)) = frames.split_first() else { return Ok((Vec::new(), Vec::new())) };
         let placed = |frame: &Frame| {
@@ -119,7 +119,7 @@ impl OfflineDetector {
         }
         let own = AgentBoxes { boxes: &boxes, output_from_agent: Isometry3::identity() };
         let found = postprocess(&[own], &self.limits);
-        // What the ego has itself does not cross the air.
+        // The ego's own map is not transmitted.
         let sent_bytes = sent_bytes.into_iter().skip(1).collect();
         Ok((found.iter().map(|candidate| candidate.detection(None)).collect(), sent_bytes))
     }

@@ -1,7 +1,7 @@
-//! Random changes of a scene that keep it a possible scene.
+//! Augmentation: random changes of a scene that keep it consistent.
 //!
-//! Mirroring and scaling are common to all vehicles of a scene; every vehicle's own frame is turned by its own angle,
-//! and the relative poses are changed accordingly. So each view, each box and each pose still belong together.
+//! Mirroring and scaling are common to all vehicles of a scene; every vehicle's own frame is rotated by its own angle,
+//! and the relative poses are changed accordingly. So views, boxes and poses remain consistent.
 
 use std::f64::consts::PI;
 
@@ -9,22 +9,22 @@ use nalgebra::{Isometry3, Matrix3, Rotation3, UnitQuaternion, Vector3};
 use protocol::{Box3d, Pose};
 use rand::Rng;
 
-/// How much a scene may be changed.
+/// Limits of the changes of a scene.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Augmentation {
     /// Probability of mirroring left and right.
     pub mirror: f64,
-    /// Largest turn of a vehicle's frame, radians.
+    /// Largest rotation of a vehicle's frame, radians.
     pub turn_rad: f64,
     /// Scale is drawn from 1 - this to 1 + this.
     pub scale: f64,
 }
 
 impl Augmentation {
-    /// Nothing is changed.
+    /// No changes.
     pub const OFF: Self = Self { mirror: 0.0, turn_rad: 0.0, scale: 0.0 };
 
-    /// Draws what a whole scene has in common.
+    /// Draws the common changes of a scene.
     pub fn scene(&self, rng: &mut impl Rng) -> SceneAugment {
         let mirrored = rng.random_bool(self.mirror);
         SceneAugment { mirrored, scale: 1.0 + self.scale * (2.0 * rng.random::<f64>() - 1.0), turn_rad: self.turn_rad }
@@ -37,7 +37,7 @@ impl Default for Augmentation {
     }
 }
 
-/// What all vehicles of a scene share.
+/// Changes common to all vehicles of a scene.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SceneAugment {
     mirrored: bool,
@@ -56,7 +56,7 @@ impl SceneAugment {
     }
 }
 
-/// The change of one vehicle's frame: mirror y, turn about z, scale.
+/// The change of one vehicle's frame: mirror y, rotate about z, scale.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ViewAugment {
     mirrored: bool,

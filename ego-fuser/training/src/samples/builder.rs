@@ -1,4 +1,4 @@
-//! One tick of a scene becomes one sample.
+//! Sample builder: turns one tick of a scene into one sample.
 
 use std::sync::Arc;
 
@@ -22,10 +22,10 @@ use fusion::MapMetadata;
 use fusion::points::merge_points;
 use fusion::targets::{Labels, TargetAssigner};
 
-/// Beyond any lattice, metres: which objects count is decided after the augmentation.
+/// Beyond any BEV grid, metres: the objects that count are selected after the augmentation.
 const ANYWHERE_M: [f64; 2] = [-1e3, 1e3];
 
-/// Which views a sample has.
+/// Views of a sample.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum SampleKind {
     /// One vehicle, and the objects that it has annotated itself.
@@ -36,27 +36,28 @@ pub enum SampleKind {
     Cooperative,
 }
 
-/// How samples are made.
+/// Configuration of samples.
 #[derive(Debug, Clone)]
 pub struct SampleConfig {
-    /// Which views.
+    /// Views of a sample.
     pub kind: SampleKind,
     /// Random changes of the scene.
     pub augmentation: Augmentation,
     /// Probability that a neighbour is missing.
     pub drop_neighbour: f64,
-    /// The poses that maps are aligned by.
+    /// The poses by which maps are aligned.
     pub poses: SamplePoses,
-    /// From which moments maps are.
+    /// Time steps of the maps.
     pub moments: Moments,
-    /// Vehicles of a sample at most, the ego included.
+    /// Largest number of vehicles of a sample, the ego included.
     pub max_agents: usize,
     /// Vehicles farther away do not take part, metres in the plane.
     pub comm_range_m: f64,
-    /// Classes of the objects that are to be found.
+    /// Classes of the target objects.
     pub classes: ClassSet,
-    /// Whether a single vehicle is also to find what only its neighbours have annotated: the rule of the evaluation. A
-    /// training by it is of single vehicles, whatever their method shares; a neighbour that is dropped has annotated nothing.
+    /// True if objects that only neighbours have annotated are targets of a single vehicle too: the rule of the
+    /// evaluation. The samples of such a training are of single vehicles, whatever their method shares; a dropped
+    /// neighbour annotates nothing.
     pub merged_truth: bool,
 }
 
@@ -78,25 +79,25 @@ impl SampleConfig {
     }
 }
 
-/// What the views of a sample are given as.
+/// Form of the views of a sample.
 #[derive(Debug)]
 pub enum SampleViews {
     /// Pillars, to be encoded.
     Pillars(Vec<Pillars>),
-    /// `[N, C, H, W]` maps, of an encoder that does not learn.
+    /// `[N, C, H, W]` maps of a frozen encoder.
     Maps(Tensor),
 }
 
-/// Views of one tick with what is to be found in them.
+/// Views of one tick with their targets.
 #[derive(Debug)]
 pub struct Sample {
     /// Every view, the ego's newest first, then the neighbours' newest, then older ones.
     pub views: SampleViews,
-    /// What is known of every view, the ego's pose being the identity.
+    /// Metadata of every view, the ego's pose being the identity.
     pub facts: Vec<MapMetadata>,
-    /// How far each view's pose is off by what was put on top of it.
+    /// Error that was added to each view's pose.
     pub offsets: Vec<Offset>,
-    /// True boxes in the ego frame with their centre on the lattice.
+    /// True boxes in the ego frame with their centre on the BEV grid.
     pub objects: Vec<Box3d>,
     /// Targets of those boxes.
     pub labels: Labels,
@@ -116,13 +117,13 @@ pub struct SampleBuilder {
 
 /// One view on its way into a sample.
 struct Entry {
-    /// Place of its vehicle in the scenario.
+    /// Index of its vehicle in the scenario.
     agent: usize,
-    /// Place of its vehicle in the sample, the ego's being 0.
+    /// Index of its vehicle in the sample, the ego's being 0.
     place: usize,
     tick: usize,
     world_from_cav: Pose,
-    /// The same without what was put on top.
+    /// Its pose without the added error.
     found: Pose,
     confidence: f64,
     age_secs: f64,
@@ -142,7 +143,7 @@ impl SampleBuilder {
         Self { scenes, config, detector, assigner, crop, voxeliser, maps: None }
     }
 
-    /// The same with maps of an encoder that does not learn, in place of pillars.
+    /// The same with maps of a frozen encoder, in place of pillars.
     #[must_use]
     pub fn with_maps(self, maps: MapSource) -> Self {
         Self { maps: Some(maps), ..self }
@@ -157,7 +158,7 @@ impl SampleBuilder {
     /// The sample of a tick, seen from a random vehicle.
     ///
     /// # Errors
-    /// [`SampleError`] when a file is missing or malformed, or nothing is known of a vehicle's pose.
+    /// [`SampleError`] when a file is missing or malformed, or a vehicle has no pose.
     pub fn build(&mut self, tick: TickRef, rng: &mut impl Rng) -> Result<Sample, SampleError> {
         let frames = self.scenes.annotations(tick);
         let present: Vec<usize> = (0..frames.len()).filter(|&agent| frames[agent].is_some()).collect();
@@ -176,8 +177,8 @@ impl SampleBuilder {
         let scene = self.config.augmentation.scene(rng);
         let changes: Vec<ViewAugment> = entries.iter().map(|_| scene.view(rng)).collect();
         let objects = self.objects(&frames, annotators, &changes[0]);
-        let (mut facts, offsets) = told(&entries, &changes);
-        // Not but for the last bits: what moves nothing is known by it.
+        let (mut facts, offsets) = metadata(&entries, &changes);
+        // Exactly, not up to rounding: the warp recognises the identity.
         facts[0].ego_from_cav = Pose::IDENTITY;
         let views = match &mut self.maps {
             Some(maps) => {
@@ -191,8 +192,8 @@ impl SampleBuilder {
         Ok(Sample { views, facts, offsets, labels: self.assigner.assign(&objects), objects })
     }
 
-    /// Which views a sample has: the newest of every vehicle, the ego first, then older ones. Vehicles that do not know
-    /// where they are have no part; an ego that does not is alone with its newest view.
+    /// Views of a sample: the newest of every vehicle, the ego first, then older ones. Vehicles without a pose have no
+    /// part; an ego without a pose is alone with its newest view.
     fn entries(&self, now: TickRef, agents: &[usize], rng: &mut impl Rng) -> Result<Vec<Entry>, SampleError> {
         let ticks = &self.scenes.scenario(now).ticks;
         let gap = self.config.moments.draw_gap(rng);
@@ -233,7 +234,7 @@ impl SampleBuilder {
         Ok(newest)
     }
 
-    /// The pose that was found, and the same with what is put on top; `place` is the agent's and of how many.
+    /// The found pose, and the same with the added error; `place` is the index of the agent and the number of agents.
     fn pose_at(
         &self,
         tick: TickRef,
@@ -261,7 +262,7 @@ impl SampleBuilder {
         let mut clouds = Vec::with_capacity(entries.len());
         for (entry, change) in entries.iter().zip(changes) {
             let points = self.scenes.points(TickRef { scenario, tick: entry.tick }, entry.agent)?;
-            // Hits on the vehicle that carries the LiDAR are cut out before anything turns.
+            // Hits on the vehicle that carries the LiDAR are removed before any rotation.
             let mut points = self.crop.without_own_body(&points);
             change.points(&mut points.xyzi);
             clouds.push(points);
@@ -274,7 +275,7 @@ impl SampleBuilder {
         Ok(clouds.iter().map(|cloud| self.voxeliser.voxelise(&cloud.xyzi)).collect())
     }
 
-    /// The ego, then the neighbours in reach that are not dropped.
+    /// The ego, then the neighbours in range that are not dropped.
     fn choose_agents(
         &self,
         tick: TickRef,
@@ -304,7 +305,7 @@ impl SampleBuilder {
         })
     }
 
-    /// What `annotators`, the ego first, have annotated, in the changed ego frame, on the lattice.
+    /// Objects annotated by `annotators`, the ego first, in the changed ego frame, on the BEV grid.
     fn objects(&self, frames: &[Option<Frame>], annotators: &[usize], ego_view: &ViewAugment) -> Vec<Box3d> {
         let range = self.detector.lidar_range_m;
         let rule = GroundTruthRule {
@@ -323,8 +324,8 @@ impl SampleBuilder {
     }
 }
 
-/// What is told of the views, and how far that is off; both after the changes of the scene.
-fn told(entries: &[Entry], changes: &[ViewAugment]) -> (Vec<MapMetadata>, Vec<Offset>) {
+/// Metadata of the views, and their pose errors; both after the changes of the scene.
+fn metadata(entries: &[Entry], changes: &[ViewAugment]) -> (Vec<MapMetadata>, Vec<Offset>) {
     let relative = |ego: &Pose, cav: &Pose, change: &ViewAugment| changes[0].pose(&ego.from_world(cav), change);
     let of_entry = |(entry, change): (&Entry, &ViewAugment)| {
         let Entry { place: agent, confidence, age_secs, .. } = *entry;

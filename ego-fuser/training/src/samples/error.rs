@@ -7,7 +7,7 @@ use tch::TchError;
 use crate::feature_store::FeatureStoreError;
 use fusion::targets::LatticeError;
 
-/// Why there is no next sample.
+/// Reason why there is no next sample.
 #[derive(Debug, thiserror::Error)]
 pub enum SampleError {
     /// A file of a dataset is missing or malformed.
@@ -16,11 +16,11 @@ pub enum SampleError {
     /// The evaluation protocol is not known or contradicts itself.
     #[error("evaluation protocol: {0}")]
     Protocol(String),
-    /// A dataset has nothing to learn from.
+    /// A dataset has no ticks.
     #[error("{0}")]
     Empty(String),
-    /// Nothing is said of a frame's pose, so views cannot be put together.
-    #[error("scenario {scenario}, {capture_nanos} ns: nothing is known of the pose of agent {cav}")]
+    /// A frame has no pose, so views cannot be aligned.
+    #[error("scenario {scenario}, {capture_nanos} ns: agent {cav} has no pose")]
     NoPose {
         /// The scenario.
         scenario: String,
@@ -29,16 +29,16 @@ pub enum SampleError {
         /// The agent.
         cav: String,
     },
-    /// The poses' error makes no sense.
+    /// The settings of the pose error are invalid.
     #[error(transparent)]
     Poses(#[from] PoseSourceError),
-    /// Maps of a frozen encoder cannot be had.
+    /// Stored maps of a frozen encoder cannot be read.
     #[error(transparent)]
     Maps(#[from] FeatureStoreError),
-    /// The tensor library refused.
+    /// The tensor library reported an error.
     #[error("samples: {0}")]
     Torch(#[from] TchError),
-    /// The anchors of the configuration are no lattice.
+    /// The anchors of the configuration are not on a grid.
     #[error(transparent)]
     Lattice(#[from] LatticeError),
 }

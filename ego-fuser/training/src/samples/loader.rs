@@ -1,4 +1,4 @@
-//! Samples in batches, in the order of a training.
+//! Loader: samples in batches, in the order of a training.
 
 use perception::pillars::batch::{PillarBatch, PillarLattice};
 use perception::train::{Prefetch, RunConfig};
@@ -20,7 +20,7 @@ use fusion::targets::Labels;
 pub enum BatchViews {
     /// Pillars, to be encoded.
     Pillars(PillarBatch),
-    /// `[sum of views, C, H, W]` maps, of an encoder that does not learn.
+    /// `[sum of views, C, H, W]` maps of a frozen encoder.
     Maps(Tensor),
 }
 
@@ -29,16 +29,16 @@ pub enum BatchViews {
 pub struct Batch {
     /// All views of all samples.
     pub views: BatchViews,
-    /// What is known of the views of each sample, ego first.
+    /// Metadata of the views of each sample, ego first.
     pub facts: Vec<Vec<MapMetadata>>,
-    /// How far the poses of the views of each sample are off, by what was put on top of them.
+    /// Errors that were added to the poses of the views of each sample.
     pub offsets: Vec<Vec<Offset>>,
     /// Targets of each sample.
     pub labels: Vec<Labels>,
 }
 
 impl Batch {
-    /// Puts samples together, all of pillars or all of maps.
+    /// Collates samples, all of pillars or all of maps.
     ///
     /// # Errors
     /// [`SampleError::Torch`] when maps are of different shapes.
@@ -67,7 +67,7 @@ impl Batch {
     /// The output of a model for all samples.
     ///
     /// # Errors
-    /// [`ModelError`] when facts and views do not add up.
+    /// [`ModelError`] when the numbers of facts and views differ.
     pub fn output(&self, model: &CooperativeModel, train: bool) -> Result<CooperativeOutput, ModelError> {
         match &self.views {
             BatchViews::Pillars(pillars) => model.forward(&pillars.to_device(model.device()), &self.facts, train),
@@ -102,7 +102,7 @@ pub fn batches(
     })
 }
 
-/// Every tick once per epoch, in an order that only the seed and the epoch decide.
+/// Every tick once per epoch, in an order that depends on the seed and the epoch only.
 #[derive(Clone)]
 struct Order {
     ticks: Vec<TickRef>,
@@ -145,7 +145,7 @@ mod tests {
             sorted.sort_by_key(|tick| tick.tick);
             assert_eq!(sorted, ticks);
         }
-        // A resumed training that begins in the middle meets the same ticks.
+        // A resumed training that begins mid-epoch uses the same ticks.
         let mut resumed = Order::new(ticks, 7);
         assert_eq!(resumed.tick(73), second[23]);
     }

@@ -1,7 +1,7 @@
 //! Training samples: scenes on disk become batches of pillars, poses and targets.
 //!
-//! Everything random about a sample follows from the seed and the sample's number, so a resumed training sees what an
-//! uninterrupted one would have seen, whatever the number of loader threads.
+//! Everything random about a sample follows from the seed and the sample's number, so a resumed training gets the same
+//! samples as an uninterrupted one, whatever the number of loader threads.
 
 mod augment;
 mod builder;

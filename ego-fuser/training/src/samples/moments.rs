@@ -1,24 +1,24 @@
-//! From which moments a sample has maps: late neighbours, and what came before.
+//! Time steps of a sample: late neighbours and earlier maps.
 
 use dataset::Tick;
 use rand::Rng;
 
-/// Steps further back than this are of no use, nanoseconds: the ego keeps none that old.
+/// Steps further back than this are not used, nanoseconds: the ego keeps none that old.
 const MAX_AGE_NANOS: u64 = fusion::history::MAX_AGE_NANOS;
 
-/// Which moments a sample spans.
+/// Time steps of a sample.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Moments {
     /// Time steps of every vehicle, the newest included.
     pub frames: usize,
-    /// Ticks between two time steps at most; every sample draws its own number.
+    /// Largest number of ticks between two time steps; every sample draws its own number.
     pub gap: usize,
-    /// Neighbours' newest maps are up to so much older than the ego's, nanoseconds.
+    /// Largest delay of neighbours' newest maps relative to the ego's, nanoseconds.
     pub max_delay_nanos: u64,
 }
 
 impl Default for Moments {
-    /// Now, and nothing else.
+    /// The current tick only.
     fn default() -> Self {
         Self { frames: 1, gap: 1, max_delay_nanos: 0 }
     }

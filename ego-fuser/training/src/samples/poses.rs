@@ -1,4 +1,4 @@
-//! Where vehicles of a sample believe to be.
+//! Poses of a sample's vehicles: recorded or localised, with an optional error.
 
 use std::f64::consts::{PI, TAU};
 use std::sync::Arc;
@@ -11,24 +11,24 @@ use rand::Rng;
 
 use super::error::SampleError;
 
-/// Poses of samples: the recording's, or those that a pose generator found; some samples with an error on top.
+/// Poses of samples: the recording's, or those of a pose generator; some samples with an added error.
 #[derive(Debug, Clone, Default)]
 pub struct SamplePoses {
-    /// Poses that were found, in place of the recording's; each table is of some of the scenarios.
+    /// Localised poses, in place of the recording's; each table covers some of the scenarios.
     pub tables: Vec<Arc<PoseTable>>,
-    /// Error on top; its seed is drawn anew for every sample.
+    /// Added error; its seed is drawn anew for every sample.
     pub noise: Option<NoisyPoseConfig>,
     /// Share of the samples that have that error.
     pub noise_share: f64,
-    /// Share of the samples in which one neighbour is somewhere else than it believes, as sure of it as before.
+    /// Share of the samples in which one neighbour has a wrong pose and is overconfident.
     pub lost_share: f64,
 }
 
-/// How far from where it believes to be a neighbour that is lost is, metres.
+/// Distance of such a neighbour from its reported position, metres.
 const LOST_M: std::ops::Range<f64> = 5.0..30.0;
 
 impl SamplePoses {
-    /// Checks the numbers of the error.
+    /// Checks the settings of the error.
     ///
     /// # Errors
     /// [`PoseSourceError`] names the field.
@@ -39,7 +39,7 @@ impl SamplePoses {
         self.noise.as_ref().map_or(Ok(()), |noise| NoisyPose::new(noise).map(|_| ()))
     }
 
-    /// The same without an error on top.
+    /// The same without an added error.
     #[must_use]
     pub fn without_noise(&self) -> Self {
         Self { noise: None, lost_share: 0.0, ..self.clone() }
@@ -47,7 +47,7 @@ impl SamplePoses {
 
     /// Draws the error of one sample.
     pub(super) fn draw(&self, rng: &mut impl Rng) -> Result<DrawnError, SampleError> {
-        // One draw less where the share is all or nothing: samples of before stay what they were.
+        // One draw fewer where the share is all or nothing: earlier samples stay the same.
         let lost = (self.lost_share > 0.0 && rng.random_bool(self.lost_share)).then(|| Lost::draw(rng));
         let is_noisy = self.noise_share >= 1.0 || rng.random_bool(self.noise_share);
         let seed = rng.random();
@@ -59,7 +59,7 @@ impl SamplePoses {
         Ok(DrawnError { noise: Some(noise), spares_ego, lost })
     }
 
-    /// Where a vehicle believes to have been, without an error on top.
+    /// Pose of a vehicle without the added error.
     pub(super) fn found(&self, scenario: &str, frame: &Frame) -> Result<PoseEstimate, SampleError> {
         let missing = || SampleError::NoPose {
             scenario: scenario.to_owned(),
@@ -74,17 +74,17 @@ impl SamplePoses {
     }
 }
 
-/// What would bring a map that was moved by a wrong pose to its place: a shift along x and y of the ego, metres, and a turn
+/// Correction that moves a map with a wrong pose to its place: a shift along x and y of the ego, metres, and a rotation
 /// about the map's sender, radians.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Offset(pub [f64; 3]);
 
 impl Offset {
-    /// The offset between where a sender was said to be and where it is, both in the ego frame.
+    /// The offset between a sender's reported and true pose, both in the ego frame.
     #[must_use]
-    pub fn between(said: &Pose, real: &Pose) -> Self {
-        let along = |axis: usize| real.translation_m[axis] - said.translation_m[axis];
-        let turn_rad = real.yaw_rad() - said.yaw_rad();
+    pub fn between(reported: &Pose, real: &Pose) -> Self {
+        let along = |axis: usize| real.translation_m[axis] - reported.translation_m[axis];
+        let turn_rad = real.yaw_rad() - reported.yaw_rad();
         Self([along(0), along(1), turn_rad.sin().atan2(turn_rad.cos())])
     }
 }
@@ -93,15 +93,15 @@ impl Offset {
 #[derive(Debug, Default)]
 pub(super) struct DrawnError {
     noise: Option<NoisyPose>,
-    /// The reference code leaves the ego exact where all others are off by the same.
+    /// The reference code leaves the ego exact where all others have the same offset.
     spares_ego: bool,
     lost: Option<Lost>,
 }
 
-/// A neighbour that is somewhere else than it believes.
+/// A neighbour with a wrong pose that is overconfident.
 #[derive(Debug, Clone, Copy)]
 struct Lost {
-    /// Decides which neighbour it is.
+    /// Selects the neighbour.
     draw: usize,
     shift_m: [f64; 2],
     turn_rad: f64,
@@ -110,16 +110,16 @@ struct Lost {
 impl Lost {
     fn draw(rng: &mut impl Rng) -> Self {
         let (distance_m, (sin, cos)) = (rng.random_range(LOST_M), rng.random_range(0.0..TAU).sin_cos());
-        // Half of them know their heading.
+        // Half of them have the right heading.
         let turn_rad = if rng.random_bool(0.5) { rng.random_range(-PI..PI) } else { 0.0 };
         Self { draw: rng.random_range(0..usize::MAX), shift_m: [distance_m * cos, distance_m * sin], turn_rad }
     }
 }
 
 impl DrawnError {
-    /// A pose with the error on top; the confidence falls with it, unless the vehicle is lost.
+    /// A pose with the added error; the confidence falls with it, unless the vehicle is lost.
     ///
-    /// `agent` is its place in a sample of `agents`, the ego being 0.
+    /// `agent` is its index in a sample of `agents`, the ego being 0.
     pub(super) fn added(
         &self,
         found: PoseEstimate,
@@ -198,22 +198,22 @@ mod tests {
         let poses = SamplePoses { lost_share: 1.0, ..SamplePoses::default() };
         for seed in 0..20 {
             let error = poses.draw(&mut ChaCha8Rng::seed_from_u64(seed)).unwrap();
-            let said: Vec<_> = (0..4).map(|agent| error.added(found, &cav, 5, [agent, 4])).collect();
-            let lost: Vec<_> = (0..4).filter(|&agent| said[agent] != found).collect();
+            let reported: Vec<_> = (0..4).map(|agent| error.added(found, &cav, 5, [agent, 4])).collect();
+            let lost: Vec<_> = (0..4).filter(|&agent| reported[agent] != found).collect();
             assert!(lost.len() == 1 && lost[0] > 0, "{lost:?}");
-            let PoseEstimate::Pose { world_from_cav, confidence } = said[lost[0]] else { panic!() };
+            let PoseEstimate::Pose { world_from_cav, confidence } = reported[lost[0]] else { panic!() };
             let [x, y, _] = world_from_cav.translation_m;
             assert!(LOST_M.contains(&x.hypot(y)) && (confidence - 0.8).abs() < 1e-6);
-            assert_eq!(error.added(found, &cav, 99, [lost[0], 4]), said[lost[0]]);
-            assert_eq!(error.added(found, &cav, 5, [0, 1]), found, "an ego alone");
+            assert_eq!(error.added(found, &cav, 99, [lost[0], 4]), reported[lost[0]]);
+            assert_eq!(error.added(found, &cav, 5, [0, 1]), found, "ego-only");
         }
     }
 
     #[test]
     fn an_offset_brings_a_map_back() {
         let real = Pose::from_xyz_yaw([20.0, -5.0, 0.0], 3.1);
-        let said = Pose::from_xyz_yaw([21.0, -5.5, 0.0], -3.1);
-        let Offset([dx, dy, turn_rad]) = Offset::between(&said, &real);
+        let reported = Pose::from_xyz_yaw([21.0, -5.5, 0.0], -3.1);
+        let Offset([dx, dy, turn_rad]) = Offset::between(&reported, &real);
         assert!((dx + 1.0).abs() < 1e-9 && (dy - 0.5).abs() < 1e-9);
         assert!((turn_rad - (6.2 - std::f64::consts::TAU)).abs() < 1e-9, "{turn_rad}");
         assert_eq!(Offset::between(&real, &real), Offset::default());

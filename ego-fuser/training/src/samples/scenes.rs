@@ -24,22 +24,22 @@ pub struct TickRef {
 /// Scenes of one or more datasets.
 ///
 /// Poses and annotations of a tick are read once and kept (some kilobytes each); points are read whenever they are
-/// asked for, and the system's page cache does the rest.
+/// needed, and the operating system's page cache keeps them.
 #[derive(Debug)]
 pub struct SceneSet {
     scenarios: Vec<Scenario>,
     ticks: Vec<TickRef>,
-    /// What was wrong with the datasets and could be left out.
+    /// Problems of the datasets that could be left out.
     problems: Vec<String>,
     known: Mutex<HashMap<TickRef, Arc<Vec<Option<Frame>>>>>,
-    /// Frames that could not be read, as they were met.
+    /// Frames that could not be read, in order of occurrence.
     unreadable: Mutex<BTreeSet<String>>,
-    /// Hash of the contents, once someone has asked: it reads a little of every file.
+    /// Hash of the contents, computed on first use: it reads a little of every file.
     sha256: OnceLock<String>,
 }
 
 impl SceneSet {
-    /// Opens datasets, splits or scenarios, with the agents of the protocol, however many.
+    /// Opens datasets, splits or scenarios, with all agents of the protocol.
     ///
     /// # Errors
     /// [`SampleError::Read`] when a folder cannot be read, [`SampleError::Protocol`] when the protocol contradicts
@@ -95,7 +95,7 @@ impl SceneSet {
         &self.scenarios
     }
 
-    /// Poses and annotations of all agents at a tick, without points, in the order of the scenario's agents; nothing of
+    /// Poses and annotations of all agents at a tick, without points, in the order of the scenario's agents; `None` for
     /// those that are absent or whose file cannot be read.
     #[must_use]
     pub fn annotations(&self, tick: TickRef) -> Arc<Vec<Option<Frame>>> {
@@ -125,7 +125,7 @@ impl SceneSet {
         Ok(self.scenario(tick).load(agent, tick.tick, &LoadOptions::default())?.points)
     }
 
-    /// Which data it is, and what was wrong with it.
+    /// Identification of the data, and their problems.
     #[must_use]
     pub fn data(&self) -> DataListing {
         let sha256 = self.sha256.get_or_init(|| dataset::content_sha256(&self.scenarios)).clone();

@@ -1,4 +1,4 @@
-//! The model card: what was trained on what, and how good it is.
+//! Model card: data, settings and accuracy of a trained model.
 
 use perception::train::ModelCard;
 
@@ -44,7 +44,7 @@ pub(super) fn card(config: &TrainConfig, model: &CooperativeModel, scenes: &Scen
         ),
     );
     if *merged_truth {
-        card.row("alone", "samples of one vehicle, which is to find what its neighbours have annotated as well");
+        card.row("ego-only", "samples of one vehicle, its neighbours' annotations are targets too");
     }
     card.row(
         "moments",
@@ -65,7 +65,10 @@ pub(super) fn card(config: &TrainConfig, model: &CooperativeModel, scenes: &Scen
     }
     if poses.lost_share > 0.0 {
         let share = 100.0 * poses.lost_share;
-        card.row("lost vehicles", format_args!("one neighbour in {share:.0} % of the samples, sure of a wrong pose"));
+        card.row(
+            "lost vehicles",
+            format_args!("one neighbour in {share:.0} % of the samples, overconfident in a wrong pose"),
+        );
     }
     if config.loss.alignment_weight > 0.0 {
         let weight = config.loss.alignment_weight;

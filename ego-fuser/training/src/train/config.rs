@@ -1,4 +1,4 @@
-//! What a training is told.
+//! Configuration of a training.
 
 use std::path::PathBuf;
 
@@ -13,34 +13,34 @@ use dataset::evaluation_protocol::ProtocolConfig;
 use fusion::FusionConfig;
 use fusion::method::Method;
 
-/// What to train, on what, for how long.
+/// Method, data and duration of a training.
 #[derive(Debug, Clone)]
 pub struct TrainConfig {
     /// Datasets to learn from.
     pub data: Vec<PathBuf>,
     /// Datasets to validate on; without any, AP is not measured.
     pub validation: Vec<PathBuf>,
-    /// Which agents take part. Range and classes stand in `samples`.
+    /// Protocol that selects agents. Range and classes are in `samples`.
     pub protocol: ProtocolConfig,
-    /// What these datasets do not say of themselves.
+    /// Options for properties that these datasets do not store.
     pub open: OpenOptions,
     /// The method.
     pub method: Method,
-    /// The network, where `init` does not say.
+    /// The network, unless `init` determines it.
     pub detector: DetectorConfig,
     /// Weights to begin with.
     pub init: Option<PathBuf>,
-    /// The fusion, where it is not that of `init` or the usual one of the method.
+    /// The fusion, if it is not that of `init` or the usual one of the method.
     pub fusion: Option<FusionConfig>,
-    /// Where the encoder of `init` stays as it is: where its maps are kept.
+    /// Store of the encoder's maps if the encoder of `init` is frozen; absent: it is trained.
     pub frozen_encoder: Option<KeptMaps>,
-    /// How; a batch are samples.
+    /// Training loop; a batch are samples.
     pub run: RunConfig,
     /// Steps between two validations.
     pub validate_every: u64,
     /// Frames of a validation.
     pub validation_frames: usize,
-    /// How samples are made.
+    /// Configuration of samples.
     pub samples: SampleConfig,
     /// The loss.
     pub loss: LossConfig,

@@ -1,4 +1,4 @@
-//! The course of a training as CSV, one row per report, with AP where a validation was made; and as a picture.
+//! Training curve: CSV with one row per report, with AP where a validation was made; and a picture.
 
 use csv::StringRecord;
 use figures::{self, Axis, Chart, Mark, Series};
@@ -11,7 +11,7 @@ use super::observer::StepReport;
 
 const HEADER: &str =
     "step,epoch,seconds,learning_rate,loss,score_loss,box_loss,samples_per_second,waiting,ap_30,ap_50,ap_70";
-/// The losses of single batches jump; a line of the picture has about this many points that do not.
+/// Points of a line in the picture: losses of single batches are noisy and are averaged to about this number.
 const SMOOTH_POINTS: usize = 150;
 
 /// Rows of reports and validations.
@@ -38,7 +38,7 @@ impl DetectorCurve {
         self.0.row(&format!("{step},,{seconds:.1},,,,,,,{ap_30:.4},{ap_50:.4},{ap_70:.4}"))
     }
 
-    /// Draws the curve so far, with what an interrupted training wrote before, into a PNG file beside it.
+    /// Draws the curve so far, including rows of an interrupted training, into a PNG file beside it.
     pub(super) fn draw(&self, title: &str) -> Result<(), TrainError> {
         let path = self.0.path();
         let text =
@@ -66,12 +66,12 @@ fn charts(title: &str, csv: &str) -> Vec<Chart> {
 /// Step and value of all rows that have one in `column`.
 fn column_over_steps(csv: &str, column: &str) -> Vec<(f64, f64)> {
     let Some(place) = HEADER.split(',').position(|name| name == column) else { return Vec::new() };
-    // A row that was cut off by the end of a process has no such column.
+    // A row that was truncated by the end of a process has no such column.
     let number = |row: &StringRecord, place| row.get(place)?.parse::<f64>().ok();
     csv_file::records(csv).filter_map(|(_, row)| Some((number(&row, 0)?, number(&row, place)?))).collect()
 }
 
-/// Means of so many neighbours that [`SMOOTH_POINTS`] are left.
+/// Means over so many neighbours that about [`SMOOTH_POINTS`] points are left.
 fn smooth(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
     let finite: Vec<(f64, f64)> = points.iter().copied().filter(|point| point.1.is_finite()).collect();
     let mean = |few: &[(f64, f64)]| {

@@ -1,4 +1,4 @@
-//! Why a training ends early.
+//! Errors of a training.
 
 use perception::train::TrainingError;
 
@@ -6,7 +6,7 @@ use crate::samples::SampleError;
 use fusion::method::Method;
 use fusion::model::ModelError;
 
-/// Why a training ended early.
+/// Reason why a training ended early.
 #[derive(Debug, thiserror::Error)]
 pub enum TrainError {
     /// The model cannot be built or run.
@@ -21,16 +21,16 @@ pub enum TrainError {
     /// The method cannot be trained.
     #[error("method {0} exchanges boxes and is not trained; train `none` and use its weights")]
     NotTrained(Method),
-    /// An encoder that does not learn must have learnt before.
+    /// A frozen encoder needs trained weights.
     #[error("a frozen encoder needs weights to begin with")]
     NothingToFreeze,
-    /// Points are put together before they are encoded, so there are no maps to keep.
+    /// Points are merged before they are encoded, so there are no maps to store.
     #[error("method {0} puts points together before the encoder and cannot be trained behind a frozen one")]
     NothingToKeep(Method),
     /// The picture of the curve cannot be written.
     #[error(transparent)]
     Picture(#[from] figures::FigureError),
-    /// The tensor library refused.
+    /// The tensor library reported an error.
     #[error("training: {0}")]
     Torch(#[from] tch::TchError),
 }

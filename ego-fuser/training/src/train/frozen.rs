@@ -1,4 +1,4 @@
-//! Training behind an encoder that stays as it is.
+//! Training behind a frozen encoder.
 
 use std::sync::Arc;
 
@@ -11,14 +11,14 @@ use crate::feature_store::{FeatureStore, FeatureStoreError, KeptMaps, MapSource,
 use crate::samples::{Augmentation, SampleConfig, SampleError, SceneSet};
 use fusion::model::{CooperativeModel, ModelError};
 
-/// An encoder that stays as it is, and where its maps are kept.
+/// A frozen encoder, and the store of its maps.
 pub(super) struct FrozenEncoder<'a> {
     kept: &'a KeptMaps,
     weights: Arc<Weights>,
 }
 
 impl<'a> FrozenEncoder<'a> {
-    /// Takes the encoder of `model` out of the training, where that is asked for. Comes before the optimizer is made.
+    /// Excludes the encoder of `model` from the training, if that is configured. Call it before the optimizer is built.
     pub(super) fn of(config: &'a TrainConfig, model: &CooperativeModel) -> Result<Option<Self>, TrainError> {
         let Some(kept) = &config.frozen_encoder else { return Ok(None) };
         let init = config.init.as_ref().ok_or(TrainError::NothingToFreeze)?;
@@ -31,7 +31,7 @@ impl<'a> FrozenEncoder<'a> {
         Ok(Some(Self { kept, weights }))
     }
 
-    /// The maps of all sweeps of some scenes, encoded now where they have not been before.
+    /// The maps of all sweeps of some scenes; missing ones are encoded now.
     pub(super) fn maps(&self, scenes: &SceneSet, observer: &mut dyn Observer) -> Result<MapSource, TrainError> {
         let on_sweep = &mut |done, all| observer.encoded(done, all);
         let open = FeatureStore::open(self.kept, &self.weights, scenes.scenarios(), on_sweep);
@@ -40,7 +40,7 @@ impl<'a> FrozenEncoder<'a> {
     }
 }
 
-/// How samples are made for a model: as many time steps as its fusion asks for, and unturned where maps are kept.
+/// Sample settings for a model: as many time steps as its fusion needs, and no rotation where maps are stored.
 pub(super) fn sample_config(config: &TrainConfig, model: &CooperativeModel) -> SampleConfig {
     let mut samples = config.samples.clone();
     samples.moments.frames = model.fusion().requirements().history.frames;

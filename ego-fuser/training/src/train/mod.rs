@@ -1,6 +1,6 @@
 //! Training of a method on recorded or generated scenes.
 //!
-//! [`run`] does no output of its own but files: whoever calls it hears of every step through [`Observer`].
+//! [`run`] writes only files: the caller gets every step through [`Observer`].
 
 mod accuracy;
 mod card;
@@ -39,19 +39,19 @@ pub fn run(config: &TrainConfig, observer: &mut dyn Observer) -> Result<Summary,
     Training::prepare(config, observer)?.run(observer)
 }
 
-/// The views that a method learns from; `is_frozen` says that its encoder does not learn, `is_alone` that nobody shares maps.
-fn sample_kind(method: Method, is_frozen: bool, is_alone: bool) -> Result<SampleKind, TrainError> {
+/// The views that a method is trained on; `is_frozen`: its encoder is frozen, `is_ego_only`: ego-only training.
+fn sample_kind(method: Method, is_frozen: bool, is_ego_only: bool) -> Result<SampleKind, TrainError> {
     match method.exchange() {
         Exchange::Nothing => Ok(SampleKind::Single),
         Exchange::Points if is_frozen => Err(TrainError::NothingToKeep(method)),
-        Exchange::Points | Exchange::Features if is_alone => Ok(SampleKind::Single),
+        Exchange::Points | Exchange::Features if is_ego_only => Ok(SampleKind::Single),
         Exchange::Points => Ok(SampleKind::Merged),
         Exchange::Features => Ok(SampleKind::Cooperative),
         Exchange::Boxes => Err(TrainError::NotTrained(method)),
     }
 }
 
-/// The model as a training finds it.
+/// The initial model of a training.
 fn first_model(config: &TrainConfig) -> Result<CooperativeModel, TrainError> {
     let TrainConfig { method, run, fusion, .. } = config;
     Ok(match (&config.init, fusion) {
@@ -131,7 +131,7 @@ impl<'a> Training<'a> {
         self.finish()
     }
 
-    /// One step; its losses, or nothing when the gradient was not finite.
+    /// One step; its losses, or `None` when the gradient was not finite.
     fn step(&mut self, batch: &Batch) -> Result<Option<[f64; 2]>, TrainError> {
         let device = self.config.run.device;
         let labels = LabelTensors::gather(&batch.labels, self.config.loss.unassigned, device);
@@ -204,7 +204,7 @@ impl<'a> Training<'a> {
     }
 }
 
-/// What has happened since the last report.
+/// Progress since the last report.
 struct Window {
     since: Instant,
     waited: Duration,
@@ -245,7 +245,7 @@ mod tests {
     }
 
     #[test]
-    fn alone_every_method_that_is_trained_learns_from_single_vehicles() {
+    fn ego_only_every_method_that_is_trained_learns_from_single_vehicles() {
         for method in [Method::NONE, Method::EARLY, Method::MAX, Method::PASTAT] {
             assert_eq!(sample_kind(method, false, true).unwrap(), SampleKind::Single, "{method}");
         }

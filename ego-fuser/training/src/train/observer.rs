@@ -1,10 +1,10 @@
-//! What a training tells.
+//! Observer of a training: progress, validations and the result.
 
 use perception::train::{DataListing, Trained};
 
 use super::accuracy::Accuracy;
 
-/// What happened in some steps.
+/// Report over some steps.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct StepReport {
     /// Steps done.
@@ -27,13 +27,13 @@ pub struct StepReport {
     pub waiting: f64,
 }
 
-/// Hears how a training goes.
+/// Receives the progress of a training.
 pub trait Observer {
     /// The data to learn from is known.
     fn opened(&mut self, data: &DataListing) {
         let _ = data;
     }
-    /// So many sweeps of all have been encoded, for an encoder that does not learn.
+    /// Number of encoded sweeps and of all, for a frozen encoder.
     fn encoded(&mut self, done: usize, all: usize) {
         let _ = (done, all);
     }
@@ -43,10 +43,10 @@ pub trait Observer {
     fn validated(&mut self, step: u64, accuracy: &Accuracy);
 }
 
-/// How a training ended.
+/// Result of a training.
 #[derive(Debug, Clone)]
 pub struct Summary {
-    /// The weights and what it took.
+    /// The weights and the cost of the training.
     pub trained: Trained,
     /// The last validation.
     pub accuracy: Option<Accuracy>,

@@ -1,4 +1,4 @@
-//! How good a model is in the middle of its training, on frames that it does not learn from.
+//! Validation: accuracy of a model during its training, on frames outside the training data.
 
 use std::sync::Arc;
 
@@ -15,8 +15,8 @@ use crate::feature_store::MapSource;
 use crate::samples::{Augmentation, Batch, Moments, SampleBuilder, SampleConfig, SampleError, SceneSet, TickRef};
 use fusion::model::CooperativeModel;
 
-/// Measures AP on a fixed choice of frames, each seen from a fixed vehicle, with nobody missing or late and no error on top
-/// of poses.
+/// Measures AP on a fixed choice of frames, each from a fixed vehicle, with no agent missing or late and no added pose
+/// error.
 #[derive(Debug)]
 pub struct Validator {
     builder: SampleBuilder,
@@ -56,7 +56,7 @@ impl Validator {
         self.builder.scenes()
     }
 
-    /// From now on samples are of maps that were kept.
+    /// Uses stored maps for samples from now on.
     pub(super) fn use_maps(&mut self, maps: MapSource) {
         self.builder = self.builder.clone().with_maps(maps);
     }
@@ -71,7 +71,7 @@ impl Validator {
         for (number, &tick) in self.ticks.iter().enumerate() {
             let mut rng = ChaCha8Rng::seed_from_u64(number as u64);
             let sample = self.builder.build(tick, &mut rng)?;
-            // The truth obeys the same limits as the detections.
+            // The ground truth has the same limits as the detections.
             let inside = |object: &&Box3d| {
                 let corners = object.corners();
                 is_within(&corners, limits.keep_range_m)

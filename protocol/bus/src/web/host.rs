@@ -1,7 +1,7 @@
-//! The name under which a server on the loopback is asked: its own, or that of a page elsewhere.
+//! Host-name check of a server on the loopback, against DNS rebinding.
 //!
-//! A page on the Internet may give its own name the address 127.0.0.1 and have the browser read what this server tells (DNS
-//! rebinding). The browser then asks for that name.
+//! A page on the Internet may map its own name to the address 127.0.0.1 and make the browser read the content of this
+//! server (DNS rebinding). The browser then requests that name.
 
 use std::net::{IpAddr, SocketAddr};
 
@@ -9,19 +9,19 @@ use hyper::Uri;
 use hyper::header::{HOST, HeaderMap};
 use hyper::http::uri::Authority;
 
-/// Checks the names for which a request at `local`, this end of the connection, asks. Over the loopback these are
-/// `localhost`, a loopback address or that of `local`, with any port, as tunnels have their own. Others are not checked:
-/// what they are called here is not known.
+/// Checks the host names of a request at `local`, this end of the connection. Over the loopback the allowed names are
+/// `localhost`, a loopback address or that of `local`, with any port, as tunnels have their own. Other addresses are
+/// not checked: their names are unknown here.
 ///
 /// # Errors
-/// The name that is none of these.
+/// The name that is not allowed.
 pub(super) fn check(local: SocketAddr, uri: &Uri, headers: &HeaderMap) -> Result<(), String> {
     if !local.ip().is_loopback() {
         return Ok(());
     }
     let named = headers.get_all(HOST).iter().map(|host| String::from_utf8_lossy(host.as_bytes()).into_owned());
-    let mut asked = uri.authority().map(ToString::to_string).into_iter().chain(named);
-    asked.find(|name| !is_here(name, local.ip())).map_or(Ok(()), Err)
+    let mut requested = uri.authority().map(ToString::to_string).into_iter().chain(named);
+    requested.find(|name| !is_here(name, local.ip())).map_or(Ok(()), Err)
 }
 
 fn is_here(name: &str, local: IpAddr) -> bool {
@@ -54,10 +54,10 @@ mod tests {
     }
 
     #[test]
-    fn every_name_counts_and_none_is_none() {
+    fn all_names_are_checked_and_none_is_allowed() {
         let local = "127.0.0.1:8088".parse().unwrap();
         let mut headers = HeaderMap::new();
-        // Version 1.0 has none, and no browser speaks it.
+        // HTTP/1.0 has none, and no browser uses it.
         assert_eq!(check(local, &Uri::from_static("/"), &headers), Ok(()));
         headers.append(HOST, "localhost".parse().unwrap());
         headers.append(HOST, "evil.example".parse().unwrap());

@@ -11,13 +11,14 @@ use crate::json::{self, Field};
 
 /// Folders of the vehicle's calibration: from LiDAR to its GNSS and IMU unit (NovAtel), and from there to the world.
 pub(super) const VEHICLE: [&str; 2] = ["vehicle-side/calib/lidar_to_novatel", "vehicle-side/calib/novatel_to_world"];
-/// Folder of the roadside unit's. Its LiDAR frame is level: a virtual one.
+/// Folder of the roadside unit's calibration. Its LiDAR frame is level: a virtual one.
 pub(super) const INFRASTRUCTURE: &str = "infrastructure-side/calib/virtuallidar_to_world";
 
-/// How far a published matrix may be off orthonormal. Some are off by a few thousandths; the nearest rotation is taken.
+/// Largest deviation of a published matrix from orthonormality. Some deviate by a few thousandths; the nearest rotation
+/// is used.
 const ROTATION_TOLERANCE: f64 = 0.05;
 
-/// Where the vehicle is.
+/// Poses of the vehicle and its LiDAR.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct VehiclePoses {
     pub(super) world_from_novatel: Isometry3<f64>,
@@ -41,9 +42,9 @@ pub(super) fn vehicle(sides: &Sides, pair: &Pair) -> Result<VehiclePoses, ReadEr
 
 /// Reads the pose of the roadside unit's LiDAR.
 ///
-/// The two sides' worlds do not quite agree. DAIR-V2X adds the pair's offset in the world, V2X-Seq in the vehicle's LiDAR
-/// frame (`Coord_transformation` and `Coord_transformation_spd` of the data sets' own code). Without an offset of the pair
-/// that of the calibration file counts (`relative_error`), as in early releases.
+/// The world frames of the two sides differ slightly. DAIR-V2X adds the pair's offset in the world, V2X-Seq in the
+/// vehicle's LiDAR frame (`Coord_transformation` and `Coord_transformation_spd` of the data sets' own code). Without an
+/// offset of the pair that of the calibration file is used (`relative_error`), as in early releases.
 pub(super) fn infrastructure(sides: &Sides, pair: &Pair) -> Result<Isometry3<f64>, ReadError> {
     let path = sides.calibration(INFRASTRUCTURE, &pair.infrastructure);
     let (world_from_lidar, own_offset_m) = read_transform(&path)?;
@@ -56,7 +57,7 @@ pub(super) fn infrastructure(sides: &Sides, pair: &Pair) -> Result<Isometry3<f64
     Ok(world_from_vehicle * offset * world_from_vehicle.inverse() * world_from_lidar)
 }
 
-/// A transform, and the offset beside it, metres: `{rotation, translation}`, some below `transform`.
+/// A transform, and the offset given with it, metres: `{rotation, translation}`, in some files below `transform`.
 fn read_transform(path: &Path) -> Result<(Isometry3<f64>, [f64; 2]), ReadError> {
     let value = json::read(path)?;
     let root = Field::root(path, &value);
@@ -67,7 +68,7 @@ fn read_transform(path: &Path) -> Result<(Isometry3<f64>, [f64; 2]), ReadError> 
     Ok((Isometry3::from_parts(translation, rotation), offset_m.unwrap_or_default()))
 }
 
-/// `{delta_x, delta_y}` in metres. One that is missing or an empty text is 0.
+/// `{delta_x, delta_y}` in metres. A missing one or an empty text is 0.
 pub(super) fn offset_m(offset: &Field<'_>) -> Result<[f64; 2], ReadError> {
     let delta = |key| offset.optional(key)?.map_or(Ok(0.0), |delta| delta.number());
     Ok([delta("delta_x")?, delta("delta_y")?])

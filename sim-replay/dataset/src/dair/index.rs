@@ -1,4 +1,4 @@
-//! Which frames belong together, when and in which batch or sequence: the three files `data_info.json`.
+//! Index of DAIR-V2X and V2X-Seq: pairs of frames with time and batch or sequence, from three files `data_info.json`.
 
 use std::collections::{BTreeMap, HashMap, HashSet};
 use std::path::Path;
@@ -13,7 +13,7 @@ pub(super) const COOPERATIVE: &str = "cooperative/data_info.json";
 /// Largest `data_info.json` that is read, bytes. Those published have up to 20 MB.
 const MAX_BYTES: u64 = 512 << 20;
 
-/// Which of the two data sets.
+/// Variant of the data set.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Kind {
     Dair,
@@ -28,7 +28,7 @@ impl Kind {
         }
     }
 
-    /// What the frames of one drive are called, and the key of its id.
+    /// Term for the frames of one drive, and the key of its id.
     fn group(self) -> (&'static str, &'static str) {
         match self {
             Self::Dair => ("batch", "batch_id"),
@@ -48,7 +48,7 @@ pub(super) struct Pair {
     sequence: Option<String>,
 }
 
-/// When and in which batch or sequence a frame of the vehicle was captured.
+/// Capture time and batch or sequence of a frame of the vehicle.
 #[derive(Debug)]
 struct Capture {
     micros: u64,
@@ -67,7 +67,7 @@ impl Index {
     /// Reads the pairs of `root`. Entries that cannot be used are left out, with a problem each.
     ///
     /// # Errors
-    /// Where there is no pair at all.
+    /// If there is no pair at all.
     pub(super) fn read(root: &Path, period_nanos: u64, problems: &mut Vec<ReadError>) -> Result<Self, ReadError> {
         let path = root.join(COOPERATIVE);
         let (kind, pairs) = read_pairs(&path, problems)?;
@@ -85,7 +85,7 @@ impl Index {
                     let group = group.as_ref().or(pair.sequence.as_ref());
                     groups.entry(group_name(kind, group)).or_default().push((*micros, pair));
                 }
-                // Without any time stamp the order of the list is the best there is.
+                // Without any time stamp the order of the list is the best available.
                 None if captures.is_empty() => {
                     let group = groups.entry(group_name(kind, pair.sequence.as_ref())).or_default();
                     let micros = (group.len() as u64).saturating_mul(period_nanos / 1000);
@@ -182,7 +182,7 @@ fn checked_id(field: &Field<'_>, id: &str) -> Result<String, ReadError> {
     Ok(id.to_owned())
 }
 
-/// Captures of the vehicle by frame id. What cannot be read is left out, with a problem.
+/// Captures of the vehicle by frame id. Entries that cannot be read are left out, with a problem.
 fn read_captures(root: &Path, kind: Kind, problems: &mut Vec<ReadError>) -> HashMap<String, Capture> {
     let path = root.join(VEHICLE_SIDE).join("data_info.json");
     let mut captures = HashMap::new();

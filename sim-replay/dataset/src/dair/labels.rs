@@ -15,18 +15,18 @@ use protocol::rotated_iou::Polygon;
 const MAX_BOXES: usize = 10_000;
 /// Largest edge of a box, metres.
 const MAX_SIZE_M: f64 = 200.0;
-/// How far the angles of a box's corners may be off 90 degrees, as a cosine.
+/// Largest deviation of the angles of a box's corners from 90 degrees, as a cosine.
 const MAX_SKEW: f64 = 0.1;
-/// Ids of a list: `block + number`. Farther apart than any number.
+/// Ids of a list are `block + number`. Blocks are farther apart than any number.
 const BLOCK: i64 = 1 << 40;
 /// Boxes of the two sides that overlap more than this, seen from above, are one object: the threshold with which the
 /// public evaluation merges the two lists.
 const SAME_OBJECT_IOU: f64 = 0.05;
 
-/// Objects that can be used, and what is wrong with the others.
+/// Valid objects, and the faults of the others.
 pub(super) type Objects = (Vec<Object>, Vec<Problem>);
 
-/// Whose list it is. The lists number their objects independently, so each has a range of ids of its own.
+/// Source of a list. The lists number their objects independently, so each has its own range of ids.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Block {
     Cooperative,
@@ -40,8 +40,8 @@ impl Block {
     }
 }
 
-/// Cooperative labels of DAIR-V2X: eight corners in the world. They have no ids: the number in the list is one, and says
-/// nothing of the object at another tick.
+/// Cooperative labels of DAIR-V2X: eight corners in the world. They have no ids: the number in the list serves as one,
+/// and does not identify the object at another tick.
 pub(super) fn in_world(path: &Path) -> Result<Objects, ReadError> {
     read(path, |number, label| {
         let Some((world_from_object, size_m)) = from_corners(&label.required("world_8_points")?)? else {
@@ -57,7 +57,7 @@ pub(super) fn in_world(path: &Path) -> Result<Objects, ReadError> {
     })
 }
 
-/// Labels in the LiDAR frame of a side: all of V2X-Seq, and those of one side of DAIR-V2X. Ids are track ids where there
+/// Labels in the LiDAR frame of a side: all of V2X-Seq, and those of one side of DAIR-V2X. Ids are track ids if there
 /// are any.
 pub(super) fn in_frame(path: &Path, world_from_lidar: &Isometry3<f64>, block: Block) -> Result<Objects, ReadError> {
     read(path, |number, label| {
@@ -98,7 +98,7 @@ fn read(
     Ok((objects, problems))
 }
 
-/// A type that is not known is no vehicle.
+/// An object of unknown type is not a vehicle.
 fn class(label: &Field<'_>) -> Result<ObjectClass, ReadError> {
     Ok(classes::of_name(label.required("type")?.text()?).unwrap_or(ObjectClass::Other))
 }
@@ -109,7 +109,7 @@ fn unknown_class(path: &Path, label: &Field<'_>) -> Option<Problem> {
     Some(classes::unknown(path.parent().unwrap_or(path), "type", &format!("{shown:?}")))
 }
 
-/// Length, width, height; nothing where one is 0: such labels have a box in the image alone.
+/// Length, width, height; nothing if one is 0: such labels have a box in the image alone.
 fn size_m(dimensions: &Field<'_>) -> Result<Option<[f64; 3]>, ReadError> {
     let edge = |key| dimensions.required(key)?.number();
     let size_m = [edge("l")?, edge("w")?, edge("h")?];
@@ -126,8 +126,9 @@ fn check_size(field: &Field<'_>, size_m: [f64; 3]) -> Result<[f64; 3], ReadError
     Err(field.error(format!("{size_m:?} are no sizes in metres, expected up to {MAX_SIZE_M}")))
 }
 
-/// Pose and size of a box from its corners: four of the bottom, in order around it from the front, then those above them.
-/// The edge from the third and fourth corner to the second and first points ahead; the first may be on either side.
+/// Pose and size of a box from its corners: four of the bottom, in order around it from the front, then those above
+/// them. The edge from the third and fourth corner to the second and first points ahead; the first may be on either
+/// side.
 fn from_corners(field: &Field<'_>) -> Result<Option<(Pose, [f64; 3])>, ReadError> {
     let numbers = field.numbers::<24>()?;
     let (corners, _) = numbers.as_chunks::<3>();
@@ -158,8 +159,8 @@ fn from_corners(field: &Field<'_>) -> Result<Option<(Pose, [f64; 3])>, ReadError
 
 /// Gives objects of one side the ids of the other side's that they overlap, so that objects of both merge by id.
 ///
-/// The two sides are labelled independently. Of several candidates the one that overlaps most is taken; each id is given
-/// once.
+/// The two sides are labelled independently. Of several candidates the one with the largest overlap is used; each id is
+/// given once.
 pub(super) fn share_ids(objects: &mut [Object], others: &[Object], lidar_from_world: &Isometry3<f64>) {
     let footprint = |object: &Object| {
         let corners = upright_box(object, lidar_from_world).corners();

@@ -1,12 +1,13 @@
-//! DAIR-V2X-C and V2X-Seq (SPD): one vehicle and one roadside unit, `{vehicle-side,infrastructure-side}/velodyne/<id>.pcd`
-//! with JSON files for calibration and labels, and `cooperative/data_info.json` that says which frames belong together.
+//! DAIR-V2X-C and V2X-Seq (SPD): one vehicle and one roadside unit,
+//! `{vehicle-side,infrastructure-side}/velodyne/<id>.pcd` with JSON files for calibration and labels, and
+//! `cooperative/data_info.json`, which pairs the frames.
 //!
-//! Frames of the two sides have different ids. A tick is a pair of `cooperative/data_info.json` and is named by the id of
-//! the vehicle; frames without partner are left out, as the data sets' own protocols do. The vehicle is the ego. The two
-//! sweeps of a pair are up to some 50 ms apart; both are given the time of the vehicle's.
+//! Frames of the two sides have different ids. A tick is a pair of `cooperative/data_info.json` and is named by the id
+//! of the vehicle; frames without partner are left out, as the data sets' own protocols do. The vehicle is the ego. The
+//! two sweeps of a pair are up to some 50 ms apart; both are given the time of the vehicle's.
 //!
 //! The cooperative labels are the ground truth of a pair ([`Frame::cooperative_objects`]). Labels of the two sides
-//! ([`Frame::objects`]) know nothing of each other: see [`labels::share_ids`].
+//! ([`Frame::objects`]) are independent of each other: see [`labels::share_ids`].
 
 mod calibration;
 mod index;
@@ -73,7 +74,7 @@ fn open_root(
     Ok(scenarios.collect())
 }
 
-/// A side is absent at a tick where a file is missing without which it has no frame; labels may be missing.
+/// A side is absent at a tick if a file is missing without which it has no frame; labels may be missing.
 fn scenario(
     name: String,
     sides: Sides,
@@ -121,7 +122,7 @@ fn scenario(
     }
 }
 
-/// Who measured.
+/// Side of a pair: vehicle or roadside unit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Side {
     Vehicle,
@@ -134,7 +135,7 @@ impl Side {
     }
 }
 
-/// Where the files of a data set lie.
+/// Folders of a data set.
 #[derive(Debug)]
 struct Sides {
     root: PathBuf,
@@ -150,7 +151,7 @@ impl Sides {
         self.root.join(folder).join("velodyne").join(format!("{id}.pcd"))
     }
 
-    /// What a side saw itself.
+    /// Labels of a side's own sweep.
     fn labels(&self, pair: &Pair, side: Side) -> PathBuf {
         let (folder, id) = match side {
             Side::Vehicle => ("vehicle-side/label/lidar", &pair.vehicle),
@@ -171,7 +172,7 @@ impl Sides {
         self.root.join(folder).join(format!("{id}.json"))
     }
 
-    /// The first file that a side cannot do without and that does not exist.
+    /// The first required file of a side that does not exist.
     fn missing_file(&self, pair: &Pair, side: Side) -> Option<PathBuf> {
         let calibrations = match side {
             Side::Vehicle => calibration::VEHICLE.map(|folder| self.calibration(folder, &pair.vehicle)).to_vec(),
@@ -223,7 +224,7 @@ impl Source {
         let path = self.sides.labels(pair, Side::Infrastructure);
         let own = labels::in_frame(&path, &world_from_lidar, Block::Infrastructure);
         frame.objects = usable(own, &mut frame.problems).unwrap_or_default();
-        // What is wrong with the vehicle's labels is a problem of its frame.
+        // Faults of the vehicle's labels are problems of its frame.
         let vehicle = calibration::vehicle(&self.sides, pair).and_then(|poses| {
             labels::in_frame(&self.sides.labels(pair, Side::Vehicle), &poses.world_from_lidar(), Block::Vehicle)
         });
@@ -234,7 +235,7 @@ impl Source {
     }
 }
 
-/// The objects of a list; what is wrong with it goes to the frame's problems.
+/// The objects of a list; its faults are added to the frame's problems.
 fn usable(labels: Result<Objects, ReadError>, problems: &mut Vec<Problem>) -> Option<Vec<Object>> {
     match labels {
         Ok((objects, wrong)) => {

@@ -22,8 +22,8 @@ const RULE: GroundTruthRule = GroundTruthRule {
 
 /// A data set of two pairs: vehicle frames 000010 and 000011, frames 000500 and 000501 of the unit, 100 ms apart.
 ///
-/// The vehicle stands at (100, 200, 20) and looks along the world's y, its LiDAR 1.8 m above; the unit's LiDAR is at
-/// (130, 200, 24) by its file, and 1.5 m farther in x and 0.5 m less in y by the pair's offset.
+/// The vehicle stands at (100, 200, 20) facing the world's y axis, its LiDAR 1.8 m above; the unit's LiDAR is at (130,
+/// 200, 24) by its file, and 1.5 m farther in x and 0.5 m less in y by the pair's offset.
 struct DataSet {
     dir: tempfile::TempDir,
     root: PathBuf,
@@ -33,7 +33,7 @@ impl DataSet {
     fn new(kind: Kind) -> Self {
         let dir = tempfile::tempdir().unwrap();
         let set = Self { root: dir.path().join("cooperative-vehicle-infrastructure"), dir };
-        // Not in the order of time: the index is.
+        // Not in the order of time, unlike the index.
         set.write("cooperative/data_info.json", &json!([set.pair(kind, 1), set.pair(kind, 0)]));
         let capture = |number: u64| {
             json!({
@@ -80,7 +80,7 @@ impl DataSet {
         );
         self.write(
             &format!("vehicle-side/calib/novatel_to_world/{vehicle}.json"),
-            // Not quite a rotation, as published ones.
+            // Not exactly a rotation, as published ones.
             &json!({"rotation": [[0, -1.001, 0], [1.001, 0, 0], [0, 0, 1.001]], "translation": [[100], [200], [20]]}),
         );
         self.write(
@@ -132,7 +132,7 @@ impl DataSet {
         messages.into_iter().map(|message| message.to_string().replace(&root, "")).collect()
     }
 
-    /// What is wrong with a frame.
+    /// Problems of a frame.
     fn problems_of(&self, agent: usize) -> (Frame, Vec<String>) {
         let frame = self.open().scenarios[0].load(agent, 0, &LoadOptions::default()).unwrap();
         let problems = self.shown(frame.problems.iter().map(|problem| &problem.message));
@@ -148,7 +148,7 @@ fn label(kind: &str, [x, y, z]: [f64; 3], rotation: f64) -> Value {
     })
 }
 
-/// A van of 4 x 2 x 1.5 m at (100, 230, 21) that looks along y.
+/// A van of 4 x 2 x 1.5 m at (100, 230, 21) that faces y.
 fn world_label() -> Value {
     let corners = |z: f64| [[99.0, 232.0, z], [101.0, 232.0, z], [101.0, 228.0, z], [99.0, 228.0, z]];
     let all: Vec<[f64; 3]> = corners(20.25).into_iter().chain(corners(21.75)).collect();
@@ -200,13 +200,13 @@ fn cooperative_labels_are_the_ground_truth_of_a_pair() {
 }
 
 #[test]
-fn without_cooperative_labels_both_sides_count_and_what_both_see_counts_once() {
+fn without_cooperative_labels_both_sides_count_and_common_objects_once() {
     let set = DataSet::new(Kind::Dair);
     set.write_bytes("cooperative/label_world/000010.json", b"[{\"type\": \"Van\",");
     let (vehicle, problems) = set.problems_of(0);
     assert_eq!(problems.len(), 1);
     assert!(problems[0].starts_with("cooperative/label_world/000010.json:1: no sound JSON: EOF"), "{problems:?}");
-    assert_eq!((vehicle.points.len(), vehicle.cooperative_objects.as_ref()), (2, None), "the frame goes on");
+    assert_eq!((vehicle.points.len(), vehicle.cooperative_objects.as_ref()), (2, None), "the frame is still read");
     let (unit, _) = set.problems_of(1);
     let merged = merge(&[&vehicle, &unit], 0, &RULE);
     let [(car, car_box), (truck, truck_box)] = &merged[..] else { panic!("{merged:?}") };
@@ -235,7 +235,7 @@ fn sequences_have_track_ids_and_their_offset_in_the_frame_of_the_vehicle() {
 }
 
 #[test]
-fn what_is_missing_is_absent_and_named() {
+fn missing_files_are_absent_and_reported() {
     let set = DataSet::new(Kind::Dair);
     set.remove("infrastructure-side/velodyne/000500.pcd");
     set.remove("vehicle-side/calib/novatel_to_world/000011.json");
@@ -279,7 +279,7 @@ fn labels_that_cannot_be_right_are_left_out_one_by_one() {
         [
             format!("{own}1.3d_dimensions: [1000000.0, 1.9, 1.5] are no sizes in metres, expected up to 200: the object is left out"),
             format!("{own}2.3d_location.y: the text \"left\", expected a finite number: the object is left out"),
-            "vehicle-side/label/lidar: type: \"Spaceship\" is no known type of object: it counts as other, not as a vehicle".into(),
+            "vehicle-side/label/lidar: type: \"Spaceship\" is an unknown type of object: it counts as other, not as a vehicle".into(),
             format!("{own}4: 3, expected a map: the object is left out"),
         ]
     );

@@ -7,7 +7,7 @@ use super::{AgentKinds, ApOrder, EgoKind, EvaluationProtocol, PRESETS, preset_of
 use crate::Layout;
 use crate::class_set::ClassSet;
 
-/// A protocol as command lines and files ask for it. What is absent is as in the preset.
+/// An evaluation protocol in command lines and files. Absent values are those of the preset.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema, clap::Args)]
 #[serde(default, deny_unknown_fields)]
 #[command(next_help_heading = "Evaluation protocol")]
@@ -20,8 +20,8 @@ pub struct ProtocolConfig {
     /// Agents farther from the ego than this do not take part, metres in the plane.
     #[arg(long = "comm-range-m", value_name = "M")]
     pub comm_range_m: Option<f64>,
-    /// Where objects count, in the ego's LiDAR frame: x, y, z low, then x, y, z high, metres. Without this the range of the
-    /// protocol ends where the area of the network ends.
+    /// Range in which objects count, in the ego's LiDAR frame: x, y, z low, then x, y, z high, metres. Without this the
+    /// range of the protocol ends at the area of the network.
     #[arg(
         long = "ground-truth-range-m",
         value_name = "M,M,M,M,M,M",
@@ -54,12 +54,12 @@ impl ProtocolConfig {
     /// The protocol for a data set of `layout`.
     ///
     /// # Errors
-    /// A sentence that names the option and both values.
+    /// A message with the option and both values.
     pub fn resolve(&self, layout: Layout) -> Result<EvaluationProtocol, String> {
         let name = self.preset.as_deref().unwrap_or(preset_of_layout(layout));
         let mut protocol = EvaluationProtocol::preset(name).ok_or_else(|| {
             let known: Vec<&str> = PRESETS.iter().map(|(name, _)| *name).collect();
-            format!("protocol {name:?} is not known; there are {}", known.join(", "))
+            format!("unknown protocol {name:?}; there are {}", known.join(", "))
         })?;
         let rule = &mut protocol.ground_truth;
         rule.comm_range_m = checked("comm_range_m", self.comm_range_m, 0.0..=1e5)?.unwrap_or(rule.comm_range_m);

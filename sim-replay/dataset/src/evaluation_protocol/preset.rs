@@ -1,4 +1,4 @@
-//! Presets: the protocols of the data sets that are read here, with their sources.
+//! Presets: the protocols of the supported data sets, with their sources.
 
 use super::{AgentKinds, ApOrder, EgoKind, EvaluationProtocol};
 use crate::Layout;
@@ -23,7 +23,7 @@ pub const PRESETS: [(&str, &str); 14] = [
     ("mars", "Open MARS, multi-agent subset"),
 ];
 
-/// The preset of a layout: what holds unless another is asked for.
+/// The default preset of a layout.
 #[must_use]
 pub fn preset_of_layout(layout: Layout) -> &'static str {
     match layout {
@@ -71,8 +71,8 @@ fn rule(name: &str) -> GroundTruthRule {
         "v2v4real" => GroundTruthRule::V2V4REAL,
         // V2X-R: opencood/hypes_yaml/V2X-R, ground truth as wide as the points.
         "v2xr" => range(140.8, 40.0, [-3.0, 1.0], 70.0),
-        // HEAL, dairv2x configurations: the range of the points, z widened by 1 m where labels are filtered. V2X-Seq's own code
-        // takes every pair, however far apart.
+        // HEAL, dairv2x configurations: the range of the points, z widened by 1 m where labels are filtered. V2X-Seq's
+        // own code takes every pair, however far apart.
         "dair" | "v2xseq" => range(102.4, 51.2, [-4.5, 2.5], 100.0),
         // V2X-Real: opencood/data_utils/datasets/__init__.py.
         "v2xreal" | "v2xreal-v2v" | "v2xreal-i2i" => range(100.0, 40.0, [-15.0, 15.0], 50.0),
@@ -82,7 +82,7 @@ fn rule(name: &str) -> GroundTruthRule {
         "v2xradar" => range(140.8, 40.0, [-3.0, 1.0], 300.0),
         // RCooper: roadside units up to 200 m apart.
         "rcooper" => range(200.0, 40.0, [-20.0, 0.0], 200.0),
-        // Open MARS has no annotations and so no protocol: a choice of ours.
+        // Open MARS has no annotations and so no protocol: chosen for this project.
         "mars" => range(51.2, 51.2, [-5.0, 3.0], 70.0),
         // OPV2V, V2XSet, V2VDet.
         _ => GroundTruthRule::OPV2V,

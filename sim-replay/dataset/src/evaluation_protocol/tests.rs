@@ -46,7 +46,7 @@ fn every_preset_has_a_protocol_of_its_name() {
 }
 
 #[test]
-fn the_layout_decides_where_nothing_is_asked_for() {
+fn the_layout_decides_without_options() {
     let resolve = |layout| ProtocolConfig::default().resolve(layout).unwrap();
     assert_eq!(resolve(Layout::Opv2v).ground_truth, GroundTruthRule::OPV2V);
     let v2v4real = resolve(Layout::V2v4Real);
@@ -76,7 +76,7 @@ fn the_range_of_a_preset_ends_with_the_area_of_the_network() {
 #[test]
 fn wrong_options_are_named_with_both_values() {
     let error = |json: &str| serde_json::from_str::<ProtocolConfig>(json).unwrap().resolve(Layout::Opv2v).unwrap_err();
-    assert!(error(r#"{"preset": "kitty"}"#).starts_with("protocol \"kitty\" is not known; there are opv2v,"));
+    assert!(error(r#"{"preset": "kitty"}"#).starts_with("unknown protocol \"kitty\"; there are opv2v,"));
     assert_eq!(error(r#"{"min_corners": 9}"#), "min_corners: 9, expected 1 to 8");
     assert_eq!(error(r#"{"comm_range_m": -1}"#), "comm_range_m: -1, expected 0 to 100000");
     assert_eq!(error(r#"{"ground_truth_range_m": [1, 2]}"#), "ground_truth_range_m: 2 numbers, expected 6");

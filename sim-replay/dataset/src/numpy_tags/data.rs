@@ -19,7 +19,7 @@ pub(super) struct Dtype {
 enum Kind {
     Float,
     Signed,
-    /// Truth values are unsigned numbers of one byte.
+    /// Booleans are unsigned numbers of one byte.
     Unsigned,
 }
 
@@ -80,7 +80,7 @@ pub(super) fn numbers(field: &Field<'_>, dtype: Dtype, count: usize) -> Result<V
 }
 
 impl Dtype {
-    /// `bytes` are as many as the size, at most 8.
+    /// Decodes `bytes`, whose length is the size, at most 8.
     fn number(self, bytes: &[u8]) -> f64 {
         let mut little = [0; 8];
         for (place, byte) in little.iter_mut().zip(bytes) {

@@ -1,9 +1,9 @@
-//! NumPy's arrays and scalars as PyYAML pickles them into text: the few node shapes that data sets contain.
+//! NumPy arrays and scalars pickled by PyYAML into text: the few node shapes that data sets contain.
 //!
 //! V2V4Real writes its pose matrices as `!!python/object/apply:numpy.core.multiarray._reconstruct` with a dtype and
-//! base64 data, converters of other data sets do so wherever numbers stand. A Python loader would call what the tag names.
-//! Here the tag is compared with the few that are known, every part of the node is checked, and anything else is an error:
-//! nothing is ever looked up or called by name.
+//! base64 data; converters of other data sets do so for any number. A Python loader would call the function named by
+//! the tag. Here the tag is compared with the few supported ones, every part of the node is checked, and anything else
+//! is an error: nothing is ever looked up or called by name.
 
 mod data;
 
@@ -13,7 +13,7 @@ use super::ReadError;
 use super::yaml::{Field, Node, Value};
 use data::{binary, numbers, read_dtype};
 
-/// What calls of Python begin with.
+/// Prefix of tags of Python calls.
 const APPLY: &str = "python/object/apply:";
 /// The modules of NumPy before and since 2.0.
 const PACKAGES: [&str; 2] = ["numpy.core", "numpy._core"];
@@ -27,17 +27,17 @@ pub(super) struct NumpyArray {
     pub(super) values: Vec<f64>,
 }
 
-/// True where the node carries a tag of Python's.
+/// True if the node carries a tag of Python's.
 pub(super) fn is_python(node: &Node) -> bool {
     node.tag.as_deref().is_some_and(|tag| tag.starts_with("python/"))
 }
 
-/// True where the node is a pickled call, and not a tuple or list of Python's.
+/// True if the node is a pickled call, and not a tuple or list of Python's.
 pub(super) fn is_call(node: &Node) -> bool {
     node.tag.as_deref().is_some_and(|tag| tag.starts_with(APPLY))
 }
 
-/// The text of a key that NumPy's scalar was used for; `None` where it is none.
+/// The text of a key that is a NumPy scalar; `None` if it is none.
 pub(super) fn key_text(node: &Node) -> Option<String> {
     scalar(&Field::root(Path::new(""), node)).ok().map(|number| number.to_string())
 }
@@ -61,7 +61,7 @@ pub(super) fn scalar(field: &Field<'_>) -> Result<f64, ReadError> {
     }
 }
 
-/// The functions of NumPy that pickled numbers name.
+/// The functions of NumPy that occur in pickled numbers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Function {
     Reconstruct,
@@ -83,7 +83,7 @@ fn function(field: &Field<'_>) -> Result<Function, ReadError> {
     let known = name.and_then(|name| KNOWN.iter().find(|(known, _)| *known == name));
     known.map(|(_, function)| *function).ok_or_else(|| {
         let tag = shown(field.node().tag.as_deref());
-        field.error(format!("tag {tag} is none of those that are known, expected numbers or NumPy's arrays of them"))
+        field.error(format!("tag {tag} is not supported, expected numbers or NumPy's arrays of them"))
     })
 }
 
@@ -129,7 +129,7 @@ fn scalar_value(field: &Field<'_>) -> Result<f64, ReadError> {
     values.first().copied().ok_or_else(|| data.error("no number"))
 }
 
-/// Arguments of a call without state are its items, or stand under `args`.
+/// Arguments of a call without state are its items, or the entry `args`.
 fn args<'a>(field: &Field<'a>) -> Result<Field<'a>, ReadError> {
     if matches!(field.node().value, Value::Map(_)) { field.required("args") } else { Ok(field.clone()) }
 }
@@ -189,7 +189,7 @@ fn ordered(shape: Vec<usize>, values: Vec<f64>, is_fortran: bool) -> NumpyArray 
     NumpyArray { shape, values }
 }
 
-/// Turns the order in which the first index runs fastest into the usual one.
+/// Converts the order in which the first index runs fastest to row-major.
 fn row_major(shape: &[usize], values: &[f64]) -> Vec<f64> {
     let place = |index: usize| {
         let (mut rest, mut place, mut stride) = (index, 0, values.len());

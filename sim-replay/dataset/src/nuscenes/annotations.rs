@@ -1,4 +1,4 @@
-//! Annotated objects of nuScenes tables, and which of them a LiDAR sees.
+//! Annotated objects of nuScenes tables, and the selection of those hit by a LiDAR.
 
 use std::collections::HashMap;
 use std::path::Path;
@@ -13,14 +13,16 @@ use crate::{ReadError, classes};
 
 /// Largest edge of a box, metres.
 const MAX_SIZE_M: f64 = 200.0;
-/// How far outside a box a point may lie to count as a hit, metres: the margin of the public converter of V2X-Sim.
+/// Largest distance of a point outside a box that counts as a hit, metres: the margin of the public converter of
+/// V2X-Sim.
 const HIT_MARGIN_M: f64 = 0.2;
-/// Categories that are named where they are not known.
+/// Unknown categories that are reported one by one.
 const MAX_UNKNOWN: usize = 20;
-/// Highest mount of a LiDAR above the roof, metres. Units beside the road hang higher.
+/// Highest mount of a LiDAR above the roof, metres. Roadside units are mounted higher.
 const MAX_MOUNT_M: f64 = 1.5;
 
-/// Objects by sample. What cannot be read is left out, with a problem; without `sample_annotation.json` there are none.
+/// Objects by sample. Rows that cannot be read are left out, with a problem; without `sample_annotation.json` there are
+/// none.
 pub(super) fn read(
     version: &Path,
     samples: &HashMap<String, usize>,
@@ -94,7 +96,7 @@ fn read_instances(version: &Path, problems: &mut Vec<ReadError>) -> Result<HashM
 
 fn unknown_type(name: &Field<'_>) -> ReadError {
     let shown: String = name.text().unwrap_or_default().chars().take(40).collect();
-    name.error(format!("{shown:?} is no known type of object: it counts as other, not as a vehicle"))
+    name.error(format!("{shown:?} is an unknown type of object: it counts as other, not as a vehicle"))
 }
 
 fn object(row: &Field<'_>, instances: &HashMap<String, Instance>) -> Result<Object, ReadError> {
@@ -111,8 +113,8 @@ fn object(row: &Field<'_>, instances: &HashMap<String, Instance>) -> Result<Obje
     Ok(Object { id: *id, class: *class, world_from_object, size_m: [length, width, height], speed_mps: None })
 }
 
-/// The objects that a sweep hits with at least one point. An object with the LiDAR inside or on its roof is the vehicle that
-/// carries it: a vehicle does not list itself.
+/// The objects that a sweep hits with at least one point. An object with the LiDAR inside or on its roof is the vehicle
+/// that carries it: a vehicle does not list itself.
 pub(super) fn seen<'a>(
     objects: &'a [Object],
     points: &PointCloud,

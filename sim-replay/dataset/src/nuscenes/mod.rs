@@ -3,7 +3,7 @@
 //!
 //! A scene is a scenario, a key frame of the ego a tick. The channel of a LiDAR names its agent: `LIDAR_TOP_id_<agent>`
 //! (V2X-Sim; 0 is the roadside unit), `LIDAR_FRONT_CENTER_<vehicle>` (Open MARS). Annotations are those of the whole
-//! scene; an agent lists what its sweep hits, as the public converter of V2X-Sim has it. Open MARS has none.
+//! scene; an agent lists the objects hit by its sweep, as in the public converter of V2X-Sim. Open MARS has none.
 
 mod annotations;
 mod rig;
@@ -26,12 +26,12 @@ use super::{Dataset, FrameSource, Layout, MissingFrame, OpenOptions, ReadError, 
 use crate::frame::{Frame, Object, ObjectClass};
 use crate::pcd::PcdCloud;
 
-/// Tables that decide: a folder with these is a version of a data set.
+/// Tables that identify the layout: a folder with these is a version of a data set.
 const TABLES: [&str; 2] = ["sample.json", "sample_data.json"];
 /// Width up to which a vehicle of V2X-Sim has two wheels, metres (the public converter drops narrower ones).
 const TWO_WHEELER_WIDTH_M: f64 = 1.5;
 
-/// Opens the data sets at or below `dir`; `None` where there are none.
+/// Opens the data sets at or below `dir`; `None` if there are none.
 pub(super) fn open(dir: &Path, options: &OpenOptions) -> Result<Option<Dataset>, ReadError> {
     let (mut scenarios, mut problems) = (Vec::new(), Vec::new());
     for version in &roots::find(dir, is_version) {
@@ -74,19 +74,19 @@ fn open_version(
     Ok(scenarios)
 }
 
-/// The layout of the first channel that is known.
+/// The layout of the first supported channel.
 fn layout(version: &Path, samples: &[Sample]) -> Result<Layout, ReadError> {
     let channels: BTreeSet<&str> = samples.iter().flat_map(|sample| sample.sweeps.keys().map(String::as_str)).collect();
     channels.iter().find_map(|channel| Some(rig::agent_of(channel)?.0)).ok_or_else(|| {
         let reason = format!(
-            "nuScenes tables without a LiDAR that is known here: {channels:?}, expected LIDAR_TOP_id_<agent> (V2X-Sim), \
+            "nuScenes tables without a supported LiDAR: {channels:?}, expected LIDAR_TOP_id_<agent> (V2X-Sim), \
              LIDAR_FRONT_CENTER_<vehicle> (Open MARS) or LIDAR_TOP (nuScenes)"
         );
         ReadError::Layout { path: version.to_owned(), reason }
     })
 }
 
-/// What a scenario is made from.
+/// Inputs of a scenario.
 struct Builder<'a> {
     root: &'a Path,
     version: &'a Path,
@@ -95,20 +95,20 @@ struct Builder<'a> {
     name: String,
 }
 
-/// What a scenario consists of.
+/// Ticks and contents of a scenario.
 #[derive(Default)]
 struct Parts {
-    /// Of the ego.
+    /// Ticks of the ego.
     ticks: Vec<Tick>,
-    /// Of any agent.
+    /// Capture times of any agent.
     moments: Vec<Tick>,
     missing: Vec<MissingFrame>,
-    /// By stem.
+    /// Contents by stem.
     contents: HashMap<String, Moment>,
 }
 
 impl Builder<'_> {
-    /// The scenario of a scene; nothing where no vehicle has a sweep.
+    /// The scenario of a scene; nothing if no vehicle has a sweep.
     fn build(
         self,
         mut samples: Vec<(Sample, Vec<Object>)>,
@@ -118,7 +118,7 @@ impl Builder<'_> {
         samples.sort_by_key(|(sample, _)| sample.micros);
         let agents = self.agents(&samples)?;
         let Some((ego, _)) = agents.first() else {
-            let reason = format!("scene {}: no sweep of any LiDAR that is known here: left out", self.scene.name);
+            let reason = format!("scene {}: no sweep of a supported LiDAR: left out", self.scene.name);
             problems.push(ReadError::malformed(&self.version.join("sample_data.json"), reason));
             return Ok(None);
         };
@@ -200,7 +200,7 @@ impl Builder<'_> {
         Ok(agents)
     }
 
-    /// Times from the first on. Where time stamps do not grow, moments are taken as evenly spaced.
+    /// Times from the first on. If time stamps do not increase, capture times are assumed to be evenly spaced.
     fn capture_times(
         &self,
         moments: &[(Sample, Vec<Object>)],
@@ -230,13 +230,13 @@ impl Sweep {
         QuarterTurns::to_forward(&self.vehicle_from_lidar)
     }
 
-    /// With x forward.
+    /// Pose of the LiDAR frame turned to x forward.
     fn world_from_lidar(&self) -> Isometry3<f64> {
         self.world_from_vehicle * self.vehicle_from_lidar * self.turns().lidar_from_turned()
     }
 }
 
-/// A tick: sweeps of the agents that are present, and all that is annotated.
+/// A tick: sweeps of the agents that are present, and all annotations.
 #[derive(Debug)]
 struct Moment {
     sweeps: HashMap<CavId, Sweep>,
@@ -259,7 +259,7 @@ impl Source {
         found.ok_or_else(|| ReadError::malformed(&self.root, format!("no sweep of agent {agent} at {}", tick.stem)))
     }
 
-    /// V2X-Sim counts whatever moves on wheels among vehicles.
+    /// V2X-Sim classifies all wheeled objects as vehicles.
     fn with_class(&self, object: &Object) -> Object {
         let is_narrow = self.layout == Layout::V2xSim && object.size_m[1] <= TWO_WHEELER_WIDTH_M;
         let class = if is_narrow && object.class.is_vehicle() { ObjectClass::TwoWheeler } else { object.class };
@@ -268,7 +268,7 @@ impl Source {
 }
 
 impl FrameSource for Source {
-    /// The sweep is read as well: what an agent lists is what it hits.
+    /// Reads the sweep as well: an agent lists the objects hit by it.
     fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame, ReadError> {
         let (moment, sweep) = self.sweep(agent, tick)?;
         let world_from_lidar = sweep.world_from_lidar();

@@ -1,4 +1,4 @@
-//! LiDARs of an agent: whose a channel is, and which way its axes point.
+//! LiDARs of an agent: the agent of a channel, and the orientation of its axes.
 
 use std::f64::consts::FRAC_PI_2;
 
@@ -10,7 +10,7 @@ use crate::Layout;
 /// The agent of data sets with one vehicle.
 const ONLY_AGENT: &str = "0";
 
-/// The layout that names its channels so, and the name of the agent; nothing for LiDARs that are not read.
+/// The layout with this naming of channels, and the name of the agent; nothing for LiDARs that are not read.
 pub(super) fn agent_of(channel: &str) -> Option<(Layout, &str)> {
     if let Some(agent) = channel.strip_prefix("LIDAR_TOP_id_") {
         return Some((Layout::V2xSim, agent));
@@ -21,13 +21,13 @@ pub(super) fn agent_of(channel: &str) -> Option<(Layout, &str)> {
     (channel == "LIDAR_TOP").then_some((Layout::NuScenes, ONLY_AGENT))
 }
 
-/// True for units beside the road: number 0 of V2X-Sim, and negative numbers as everywhere.
+/// True for roadside units: number 0 of V2X-Sim, and negative numbers as in other layouts.
 pub(super) fn is_roadside_unit(layout: Layout, agent: &str) -> bool {
     (layout == Layout::V2xSim && agent == "0") || agent.starts_with('-')
 }
 
-/// Quarter turns, counter-clockwise, that bring the axes of a LiDAR to x forward: nuScenes mounts its own with y forward.
-/// What is left of the mount's rotation stays in the pose.
+/// Quarter turns, counter-clockwise, that bring the axes of a LiDAR to x forward: nuScenes mounts its own with y
+/// forward. The remaining rotation of the mount stays in the pose.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct QuarterTurns(u8);
 
@@ -45,7 +45,7 @@ impl QuarterTurns {
         Isometry3::from_parts(Default::default(), UnitQuaternion::from_axis_angle(&Vector3::z_axis(), angle))
     }
 
-    /// Takes points from the LiDAR's own frame to the turned one, exactly.
+    /// Transforms points from the LiDAR's own frame to the turned one, exactly.
     pub(super) fn apply(self, cloud: &mut PointCloud) {
         for [x, y, ..] in &mut cloud.xyzi {
             (*x, *y) = match self.0 {

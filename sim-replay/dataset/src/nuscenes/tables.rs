@@ -1,5 +1,5 @@
-//! Tables of nuScenes: JSON lists whose rows refer to each other by tokens. They are read in an order in which each tells
-//! which rows of the next are needed: a table may have gigabytes, most of it about cameras.
+//! Tables of nuScenes: JSON lists whose rows refer to each other by tokens. Each table determines the needed rows of
+//! the next one that is read: a table may have gigabytes, most of it about cameras.
 
 use std::collections::HashMap;
 use std::path::{Component, Path};
@@ -15,7 +15,7 @@ use crate::json_table::{self, Keys};
 
 /// Largest table that is read, bytes. `sample_data.json` of nuScenes' `v1.0-trainval` has about 1.2 GB.
 const MAX_BYTES: u64 = 4 << 30;
-/// How far a published quaternion's length may be off 1; it is normalized.
+/// Largest deviation of a published quaternion's length from 1; it is normalized.
 const QUATERNION_TOLERANCE: f64 = 0.01;
 
 /// A drive.
@@ -26,7 +26,7 @@ pub(super) struct Scene {
     pub(super) vehicles: Vec<String>,
 }
 
-/// A moment of a drive, with the sweeps of all LiDARs.
+/// A sample of a drive, with the sweeps of all LiDARs.
 #[derive(Debug)]
 pub(super) struct Sample {
     /// Index of the scene.
@@ -36,7 +36,7 @@ pub(super) struct Sample {
     pub(super) sweeps: HashMap<String, Sweep>,
 }
 
-/// Where a sweep lies, and where its LiDAR was.
+/// File of a sweep, and the pose of its LiDAR.
 #[derive(Debug, Clone)]
 pub(super) struct Sweep {
     /// Path below the root of the data set.
@@ -45,7 +45,7 @@ pub(super) struct Sweep {
     pub(super) vehicle_from_lidar: Isometry3<f64>,
 }
 
-/// What readers need of the tables.
+/// Contents of the tables that the reader needs.
 #[derive(Debug, Default)]
 pub(super) struct Tables {
     pub(super) scenes: Vec<Scene>,
@@ -68,10 +68,10 @@ struct SweepRow {
     mount: Mount,
 }
 
-/// Reads the tables in the folder `version`. Rows that cannot be used are left out, with a problem each.
+/// Reads the tables in the folder `version`. Unusable rows are left out, with a problem each.
 ///
 /// # Errors
-/// Where a table is missing or broken before its first row. Annotations may be missing.
+/// If a table is missing or broken before its first row. Annotations may be missing.
 pub(super) fn read(version: &Path, problems: &mut Vec<ReadError>) -> Result<Tables, ReadError> {
     let mounts = read_mounts(version, problems)?;
     let (scenes, scene_indices) = read_scenes(version, problems)?;
@@ -199,7 +199,7 @@ fn read_sweeps(
     Ok(sweeps)
 }
 
-/// Gives the samples their sweeps, with the poses of the vehicles.
+/// Assigns the sweeps to the samples, with the poses of the vehicles.
 fn place(
     version: &Path,
     mut rows: HashMap<String, Vec<SweepRow>>,

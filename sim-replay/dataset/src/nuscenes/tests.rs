@@ -26,7 +26,7 @@ struct Rig {
     points: Vec<[f32; 5]>,
 }
 
-/// A data set of one scene with two samples 200 ms apart, and what is annotated at both.
+/// A data set of one scene with two samples 200 ms apart, and the annotations of both.
 struct DataSet {
     dir: tempfile::TempDir,
     version: &'static str,
@@ -73,7 +73,7 @@ impl DataSet {
                 }));
             }
             data.push(json!({"token": "c", "calibrated_sensor_token": "mount_camera", "is_key_frame": true}));
-            // A sweep between two samples, and a pose that nobody needs.
+            // A sweep between two samples, and a pose that is not needed.
             data.push(json!({"token": "s", "calibrated_sensor_token": "mount0", "is_key_frame": false}));
             poses.push(json!({"token": "c"}));
         }
@@ -131,7 +131,7 @@ fn place(translation_m: [f64; 3], size_wlh: [f64; 3], degrees: f64) -> Value {
     json!({"translation": translation_m, "size": size_wlh, "rotation": quaternion(degrees)})
 }
 
-/// Vehicle 1 at (10, 20) looks along y, vehicle 2 at (10, 50) along x, the unit's LiDAR is at (0.5, 0, 2).
+/// Vehicle 1 at (10, 20) faces y, vehicle 2 at (10, 50) faces x, the unit's LiDAR is at (0.5, 0, 2).
 fn v2x_sim() -> DataSet {
     let rig = |channel, position_m, heading_degrees, points| Rig {
         channel,
@@ -159,7 +159,7 @@ fn v2x_sim() -> DataSet {
             ("vehicle.car", place([10.0, 20.0, 0.75], [2.0, 4.0, 1.5], 90.0)),
             ("human.pedestrian.adult", place([10.0, 25.0, 0.9], [0.6, 0.6, 1.8], 0.0)),
             ("vehicle.narrow.one", place([20.0, 50.0, 0.8], [0.8, 2.0, 1.6], 0.0)),
-            // Nobody's sweep hits it.
+            // Not hit by any sweep.
             ("vehicle.truck", place([-5.0, 20.0, 1.5], [2.5, 8.0, 3.0], 0.0)),
         ],
     )
@@ -310,17 +310,17 @@ fn rows_that_cannot_be_used_are_left_out_one_by_one() {
 }
 
 #[test]
-fn categories_that_are_not_known_are_no_vehicles_and_named() {
+fn unknown_categories_are_no_vehicles_and_reported() {
     let set = v2x_sim();
     set.annotate(&[("spaceship", place([10.0, 40.0, 0.75], [2.0, 4.0, 1.5], 90.0))]);
     let dataset = set.open();
-    let expected = "v1.0-mini/category.json: 0.name: \"spaceship\" is no known type of object: it counts as other, not as a vehicle";
+    let expected = "v1.0-mini/category.json: 0.name: \"spaceship\" is an unknown type of object: it counts as other, not as a vehicle";
     assert_eq!(set.problems(&dataset), [expected]);
     assert_eq!(load(&dataset.scenarios[0], 0)[0].objects[0].class, ObjectClass::Other);
 }
 
 #[test]
-fn tables_that_are_no_data_set_are_named() {
+fn tables_that_are_no_data_set_are_reported() {
     let set = v2x_sim();
     let message = || {
         let error = crate::open(set.dir.path()).unwrap_err().to_string();
@@ -337,7 +337,7 @@ fn tables_that_are_no_data_set_are_named() {
 }
 
 #[test]
-fn the_folder_of_the_tables_opens_as_well_and_versions_are_told_apart() {
+fn the_folder_of_the_tables_opens_as_well_and_versions_are_distinguished() {
     let set = v2x_sim();
     let own = crate::open(&set.dir.path().join("v1.0-mini")).unwrap();
     assert_eq!((own.scenarios[0].name.as_str(), own.scenarios[0].ticks.len()), ("v1.0-mini/scene_5", 2));

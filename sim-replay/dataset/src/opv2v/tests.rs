@@ -72,7 +72,7 @@ fn a_frame_is_mirrored_as_a_whole() {
     assert_eq!(frame.speed_mps, Some(10.0));
     let car = &frame.objects[0];
     assert_eq!((car.id, car.size_m, car.speed_mps), (4335, [4.0, 2.0, 1.5], Some(5.0)));
-    // `center` is added without being turned, though the car is.
+    // `center` is added without rotation, though the car is rotated.
     assert_eq!(car.world_from_object.translation_m, [10.5, -30.0, 0.7]);
     let ahead = lidar.isometry().inverse() * car.world_from_object.isometry();
     assert!((ahead.translation.vector.x - 10.0).abs() < 1e-6 && (ahead.translation.vector.y - 0.5).abs() < 1e-6);
@@ -168,7 +168,7 @@ fn a_part_that_cannot_be_right_is_left_out_and_named() {
 }
 
 #[test]
-fn what_is_no_list_of_objects_is_left_out_as_a_whole() {
+fn an_invalid_list_of_objects_is_left_out_as_a_whole() {
     for (to, expected) in [
         ("cars:", ":1: vehicles: missing: the list of objects is left out"),
         (
@@ -203,7 +203,7 @@ fn types_are_read_by_whatever_key() {
         let frame = load_with("speed: 18", &format!("speed: 18\n    {key}: Pedestrian")).unwrap();
         assert_eq!((frame.objects[0].class, frame.problems.len()), (ObjectClass::Pedestrian, 0), "{key}");
     }
-    for (kind, found) in [("Ufo", "class: the text \"Ufo\" is no known type"), ("5", "class: 5 is no known type")] {
+    for (kind, found) in [("Ufo", "class: the text \"Ufo\" is an unknown type"), ("5", "class: 5 is an unknown type")] {
         let frame = load_with("speed: 18", &format!("speed: 18\n    class: {kind}")).unwrap();
         assert_eq!(frame.objects[0].class, ObjectClass::Other);
         let message = &frame.problems[0].message;
@@ -282,7 +282,7 @@ fn copies_of_agents_and_loose_frames_are_no_agents() {
 }
 
 #[test]
-fn links_to_nothing_cost_what_they_stand_for() {
+fn dangling_links_cost_only_their_targets() {
     let dir = tempfile::tempdir().unwrap();
     let link = |name: &str| std::os::unix::fs::symlink("/nowhere", dir.path().join(name)).unwrap();
     write_frame(dir.path(), "scene/1/000070", YAML, &[]);

@@ -4,12 +4,12 @@ use super::header::{Field, Header, IntensitySource, Kind};
 use super::number::{is_separator, ordinary, unusual};
 use super::{PcdCloud, PcdError, Place, unpack_rgb};
 
-/// What to do with the numbers of a field.
+/// Use of the numbers of a field.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Column {
-    /// Goes to this component of the point.
+    /// Stored in this component of the point.
     Component(usize),
-    /// A packed colour printed as a float: its bits count.
+    /// A packed colour printed as a float: its bits are used.
     FloatColour,
     /// A packed colour printed as an integer.
     IntegerColour,
@@ -17,7 +17,8 @@ enum Column {
 }
 
 pub(super) fn decode(header: &Header, body: &[u8]) -> Result<PcdCloud, PcdError> {
-    // A number and its separator are two bytes at least: the header cannot make us reserve more than the file's size.
+    // A number and its separator are two bytes at least: the header cannot cause a reservation of more than the file's
+    // size.
     let possible = body.len() / (2 * header.columns()) + 1;
     let is_labelled = matches!(header.intensity, IntensitySource::Red(_));
     let mut points = Vec::with_capacity(header.points.min(possible));
@@ -47,7 +48,7 @@ struct Lines<'a> {
     header: &'a Header,
     columns: Vec<Column>,
     rest: &'a [u8],
-    /// From the first value of the line on that was begun last.
+    /// From the first value of the line that was begun last.
     begun: &'a [u8],
     /// The line of the point that was read last, from 1.
     line: u64,
@@ -88,7 +89,7 @@ impl<'a> Lines<'a> {
         Ok(Some((point, label)))
     }
 
-    /// Skips blanks; whether the line, or the text, ends behind them.
+    /// Skips blanks; true if the line, or the text, ends after them.
     fn is_at_end_of_line(&mut self) -> bool {
         let is_blank = |&byte: &u8| byte != b'\n' && is_separator(byte);
         while let Some((_, rest)) = self.rest.split_first().filter(|(byte, _)| is_blank(byte)) {
@@ -125,7 +126,7 @@ impl<'a> Lines<'a> {
                 // The bits of a printed NaN are lost, and the intensity with them.
                 (if value.is_nan() { f32::NAN } else { red }, green)
             }),
-            // `TYPE I` prints colours with alpha as negative numbers; the low 32 bits are what counts.
+            // `TYPE I` prints colours with alpha as negative numbers; only the low 32 bits are used.
             _ => std::str::from_utf8(token)
                 .ok()
                 .and_then(|text| text.parse().ok())
@@ -155,7 +156,7 @@ impl<'a> Lines<'a> {
         PcdError::at(self.line, name, format!("{found} values in the line, expected {expected}"))
     }
 
-    /// A last line that is wrong and does not end is no typing mistake.
+    /// A malformed last line without line end means a truncated file.
     fn cut_off(&self, error: PcdError, read: usize) -> PcdError {
         if self.begun.contains(&b'\n') {
             return error;
@@ -176,12 +177,12 @@ fn columns(header: &Header) -> Vec<Column> {
     header.fields.iter().enumerate().map(column).collect()
 }
 
-/// Colours that were read before, by the bytes of their tokens: a sweep has few, and they take long to parse.
+/// Cache of parsed colours, by the bytes of their tokens: a sweep has few distinct ones, and parsing is slow.
 struct Colours(Vec<(u128, (f32, u8))>);
 
 impl Default for Colours {
     fn default() -> Self {
-        // No token is without a byte.
+        // No token is empty.
         Self(vec![(0, (0.0, 0)); 256])
     }
 }
@@ -224,7 +225,7 @@ mod tests {
         .into_bytes()
     }
 
-    /// Red of the word a dataset stores, printed as it prints it.
+    /// Red of the word stored by a data set, printed in the same way.
     fn red_of(token: &str) -> f32 {
         let file = file("x y z rgb", "F F F F", &[&format!("1 2 3 {token}")]);
         decode(&file).unwrap().points.xyzi[0][3] * 255.0
@@ -260,7 +261,7 @@ mod tests {
     }
 
     #[test]
-    fn the_green_byte_is_a_label_where_it_says_anything() {
+    fn the_green_byte_is_a_label_if_it_is_not_zero() {
         let clean = file("x y z rgb", "F F F U", &["1 2 3 65536", "1 2 3 65536"]);
         assert_eq!(decode(&clean).unwrap().labels, None);
         let snow = file("x y z rgb", "F F F U", &["1 2 3 65536", "1 2 3 66048"]);
@@ -288,7 +289,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wrong_in_a_line_is_named() {
+    fn a_fault_in_a_line_is_reported() {
         let message = |lines: &[&str]| decode(&file("x y z rgb", "F F F F", lines)).unwrap_err().to_string();
         assert_eq!(message(&["1 2 3 0", "1 2 three 0"]), "line 12: z: \"three\" is no number");
         assert_eq!(message(&["1 2 3"]), "line 11: rgb: 3 values in the line, expected 4");

@@ -1,12 +1,12 @@
 //! Points as little-endian numbers, plain or packed.
 //!
-//! Behind the points there may be more: PCL's writers stretch files to whole pages. So the rule for lengths is "at least",
-//! but for the unpacked one, by which fields are found.
+//! The points may be followed by more bytes: PCL's writers extend files to whole pages. So lengths are checked as "at
+//! least", except for the unpacked one, which determines the positions of fields.
 
 use super::header::{Field, Header, IntensitySource, Kind};
 use super::{PcdCloud, PcdError, lzf, unpack_rgb};
 
-/// Where a field's numbers lie: that of point `i` at `first + i * step`.
+/// Position of a field's numbers: that of point `i` at `first + i * step`.
 #[derive(Debug, Clone, Copy)]
 struct Column {
     first: usize,
@@ -74,7 +74,7 @@ fn gather(header: &Header, data: &[u8], column: impl Fn(usize) -> Column) -> Pcd
     let mut labels = Vec::new();
     match header.intensity {
         IntensitySource::Value(index) => column(index).fill(data, &mut points, 3),
-        // The four bytes of a packed colour; whether they are called a float or an integer does not matter.
+        // The four bytes of a packed colour, whether declared a float or an integer.
         IntensitySource::Red(index) => {
             labels.reserve_exact(points.len());
             column(index).each(data, &mut points, |point, bytes| {
@@ -101,7 +101,7 @@ impl Column {
             (Kind::Signed, 2) => self.numbers(data, points, component, |bytes| f32::from(i16::from_le_bytes(bytes))),
             (Kind::Signed, 4) => self.numbers(data, points, component, |bytes| i32::from_le_bytes(bytes) as f32),
             (Kind::Signed, _) => self.numbers(data, points, component, |bytes| i64::from_le_bytes(bytes) as f32),
-            // The header lets nothing else through.
+            // The header accepts no other type.
             (Kind::Unsigned | Kind::Other, _) => {
                 self.numbers(data, points, component, |bytes| u64::from_le_bytes(bytes) as f32);
             }
@@ -118,7 +118,7 @@ impl Column {
         self.each(data, points, |point, bytes| point[component] = number(bytes));
     }
 
-    /// Hands over each point with its bytes.
+    /// Passes on each point with its bytes.
     fn each<const N: usize>(self, data: &[u8], points: &mut [[f32; 4]], mut take: impl FnMut(&mut [f32; 4], [u8; N])) {
         let chunks = data.get(self.first..).unwrap_or_default().chunks(self.step);
         for (point, chunk) in points.iter_mut().zip(chunks) {

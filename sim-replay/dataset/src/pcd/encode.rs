@@ -4,16 +4,16 @@ use std::fmt::Write;
 
 use protocol::PointCloud;
 
-/// How points are written.
+/// Encoding of points.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Encoding {
-    /// A line of shortest decimal numbers per point: every `f32` comes back bit by bit.
+    /// A line of shortest decimal numbers per point: every `f32` is restored bit by bit.
     Ascii,
     /// Little-endian numbers.
     Binary,
 }
 
-/// Where intensity is written.
+/// Field of the intensity.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum IntensityField<'a> {
     /// A float field `intensity`, exact.
@@ -24,7 +24,7 @@ pub enum IntensityField<'a> {
     RedAndLabel(&'a [u8]),
 }
 
-/// A PCD file of these points, in the frame and handedness they are in.
+/// A PCD file of these points, in their frame and handedness.
 #[must_use]
 pub fn encode(cloud: &PointCloud, encoding: Encoding, intensity: IntensityField<'_>) -> Vec<u8> {
     let (data, bytes_per_point) = match encoding {

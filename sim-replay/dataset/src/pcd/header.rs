@@ -1,26 +1,27 @@
-//! The header of a PCD file: what every field is and how many points follow.
+//! Header of a PCD file: type of every field and number of points.
 //!
-//! Writers differ: `VERSION` is `.7`, `0.5` or not there, `FIELDS` may be called `COLUMNS`, `COUNT` (1 each), `HEIGHT`,
-//! `VIEWPOINT`, and `POINTS` or `WIDTH` may be missing, keys may be in lower case, and a field may have no numbers at all.
+//! Writers differ: `VERSION` is `.7`, `0.5` or missing, `FIELDS` may be called `COLUMNS`, `COUNT` (1 each), `HEIGHT`,
+//! `VIEWPOINT`, and `POINTS` or `WIDTH` may be missing, keys may be in lower case, and a field may have no numbers at
+//! all.
 
 mod points;
 
 use super::{IntensityKind, PcdError};
 
 const MAX_FIELDS: usize = 64;
-/// Longest header line that is looked at, bytes.
+/// Longest header line that is read, bytes.
 const MAX_LINE: usize = 8192;
 /// Most numbers in one field of one point.
 const MAX_COUNT: u64 = 65_536;
 /// Most bytes of one number.
 const MAX_SIZE: usize = 8;
-/// Names of intensity, the preferred first, whatever their case.
+/// Names of intensity, the preferred first, compared without case.
 const INTENSITY: [&str; 8] =
     ["intensity", "i", "scalar_intensity", "reflectivity", "scalar_reflectivity", "reflectance", "remission", "signal"];
 /// Names of packed colours, whose red byte is an intensity.
 const COLOURS: [&str; 2] = ["rgb", "rgba"];
 
-/// How the points are stored.
+/// Storage of the points.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Data {
     /// A line of decimal numbers per point.
@@ -32,7 +33,7 @@ pub(super) enum Data {
 }
 
 impl Data {
-    /// The form in words.
+    /// Name of the storage.
     pub(super) fn name(self) -> &'static str {
         match self {
             Self::Ascii => "PCD, ascii",
@@ -42,7 +43,7 @@ impl Data {
     }
 }
 
-/// What one number of a field is.
+/// Type of one number of a field.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Kind {
     /// `TYPE F`, 4 or 8 bytes.
@@ -51,7 +52,7 @@ pub(super) enum Kind {
     Signed,
     /// `TYPE U`, 1, 2, 4 or 8 bytes.
     Unsigned,
-    /// Anything else: only fields that are not read have it.
+    /// Any other type: accepted only for fields that are not read.
     Other,
 }
 
@@ -66,18 +67,18 @@ pub(super) struct Field {
     pub(super) count: usize,
 }
 
-/// Which field the fourth value of a point comes from.
+/// Source of the fourth value of a point.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum IntensitySource {
-    /// The field at this index, as it is.
+    /// The field at this index, unchanged.
     Value(usize),
     /// The red byte of the packed field at this index.
     Red(usize),
-    /// There is none: 0 for all.
+    /// No source: 0 for all.
     None,
 }
 
-/// A header whose parts fit each other.
+/// A header whose parts are consistent.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Header {
     pub(super) fields: Vec<Field>,
@@ -90,13 +91,13 @@ pub(super) struct Header {
     pub(super) lines: u64,
 }
 
-/// The values of one header line and where they stand.
+/// The values of one header line and their position.
 struct Entry<'a> {
     line: u64,
     values: Vec<&'a str>,
 }
 
-/// The header lines by key, before anything is checked.
+/// The header lines by key, unchecked.
 #[derive(Default)]
 struct Entries<'a> {
     found: Vec<(&'static str, Entry<'a>)>,
@@ -107,7 +108,7 @@ const KEYS: [&str; 10] =
 const VERSIONS: [&str; 6] = ["0.7", ".7", "0.6", ".6", "0.5", ".5"];
 
 impl Header {
-    /// Splits a file into its header and what follows it.
+    /// Splits a file into its header and the rest.
     pub(super) fn parse(bytes: &[u8]) -> Result<(Self, &[u8]), PcdError> {
         let mut entries = Entries::default();
         let mut rest = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes);
@@ -146,7 +147,7 @@ impl Header {
         self.fields.iter().map(|field| field.count * field.size).sum()
     }
 
-    /// Name of the field that intensity comes from, and what stores it.
+    /// Name and number type of the field from which intensity is read.
     pub(super) fn intensity_origin(&self) -> Option<(&str, IntensityKind)> {
         match self.intensity {
             IntensitySource::Red(index) => Some((&self.fields[index].name, IntensityKind::RedByte)),
@@ -159,7 +160,7 @@ impl Header {
         }
     }
 
-    /// The fields that are read must be numbers; of all others the size is enough.
+    /// The fields that are read must be numbers; of all others only the size is needed.
     fn check_formats(&self, entries: &Entries<'_>) -> Result<(), PcdError> {
         let intensity = match self.intensity {
             IntensitySource::Value(index) | IntensitySource::Red(index) => Some(index),
@@ -208,7 +209,7 @@ impl<'a> Entries<'a> {
             return Err(PcdError { line: Some(line), field: None, reason: format!("{word:?} is no PCD header key") });
         };
         if self.has(key) {
-            return Err(PcdError::at(line, key, "stands here a second time"));
+            return Err(PcdError::at(line, key, "is given a second time"));
         }
         self.found.push((key, Entry { line, values: words.collect() }));
         Ok(())
@@ -272,7 +273,7 @@ impl<'a> Entries<'a> {
             .collect()
     }
 
-    /// The sensor's place is not applied to the points (PCL does not either), but must make sense.
+    /// The sensor's pose is not applied to the points (PCL does not either), but must be valid.
     fn check_viewpoint(&self) -> Result<(), PcdError> {
         let Some(entry) = self.find("VIEWPOINT") else { return Ok(()) };
         if entry.values.len() != 7 {
@@ -323,7 +324,7 @@ fn find_coordinate(fields: &[Field], name: &str, line: u64) -> Result<usize, Pcd
     let mut found = fields.iter().enumerate().filter(|(_, field)| field.name.eq_ignore_ascii_case(name));
     let (index, field) = found.next().ok_or_else(|| PcdError::at(line, "FIELDS", format!("no field {name}")))?;
     if found.next().is_some() {
-        return Err(PcdError::at(line, "FIELDS", format!("{name} stands there twice")));
+        return Err(PcdError::at(line, "FIELDS", format!("{name} is given twice")));
     }
     if field.count != 1 {
         return Err(PcdError::at(line, "COUNT", format!("{} of field {name}, expected 1", field.count)));

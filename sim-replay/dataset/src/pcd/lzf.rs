@@ -4,17 +4,17 @@
 //! control byte repeats earlier output: its upper three bits are the length minus two (7: one more byte adds to it),
 //! its lower five bits and one more byte are the distance back minus one.
 
-/// Bytes that one byte of input can become at most: three bytes of input repeat up to 264.
+/// Largest number of output bytes per input byte: three bytes of input repeat up to 264.
 const MAX_RATIO: usize = 88;
 
-/// Why bytes are not an LZF stream of the stated length.
+/// Reasons why bytes are not an LZF stream of the stated length.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub(super) enum LzfError {
     #[error("{packed} packed bytes cannot become {unpacked}")]
     Ratio { packed: usize, unpacked: usize },
     #[error("the packed bytes end inside a block")]
     CutOff,
-    #[error("a block repeats what lies {distance} bytes back, but only {len} bytes came before")]
+    #[error("a block repeats output {distance} bytes back, but only {len} bytes precede it")]
     Distance { distance: usize, len: usize },
     #[error("{found} bytes unpacked, {stated} stated")]
     Length { found: usize, stated: usize },
@@ -58,7 +58,7 @@ fn repeat<'a>(output: &mut Vec<u8>, input: &'a [u8], control: usize) -> Result<&
     let distance = ((control & 31) << 8) + byte()? + 1;
     let len = output.len();
     let start = len.checked_sub(distance).ok_or(LzfError::Distance { distance, len })?;
-    // What is repeated may overlap what is written: byte by byte, unless it does not.
+    // The repeated range may overlap the output: copied byte by byte, unless it does not.
     if distance >= count {
         output.extend_from_within(start..start + count);
     } else {
@@ -75,7 +75,7 @@ pub(super) mod tests {
 
     use super::*;
 
-    /// A plain packer: greedy over the last 8 KiB. Slow, and enough to make files to read.
+    /// A simple packer: greedy over the last 8 KiB. Slow, but sufficient for test files.
     pub(in crate::pcd) fn compress(data: &[u8]) -> Vec<u8> {
         let mut packed = Vec::new();
         let mut pending: Vec<u8> = Vec::new();
@@ -135,7 +135,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn what_cannot_be_is_refused() {
+    fn an_impossible_stream_is_refused() {
         assert_eq!(decompress(&[0, b'a'], 1_000_000), Err(LzfError::Ratio { packed: 2, unpacked: 1_000_000 }));
         assert_eq!(decompress(&[3, b'a'], 4), Err(LzfError::CutOff));
         assert_eq!(decompress(&[0, b'a', 0x20, 9], 4), Err(LzfError::Distance { distance: 10, len: 1 }));

@@ -2,9 +2,9 @@
 //!
 //! Intensity comes from the field `intensity`, else from the red byte of `rgb`: OPV2V stores R / 255 there, in a word
 //! `0x00RRGGBB` whose bits are printed as a float. Every red below 128 is a subnormal number then, so the text is
-//! parsed exactly and only the bits are looked at.
+//! parsed exactly and only the bits are used.
 //!
-//! Points stay in the frame and handedness of the file; mirroring is the business of the datasets' readers.
+//! Points stay in the frame and handedness of the file; mirroring is done by the readers of data sets.
 //!
 //! ```
 //! use protocol::PointCloud;
@@ -32,35 +32,35 @@ use header::{Data, Header};
 /// Red of full intensity.
 const RED_SCALE: f32 = 255.0;
 
-/// What a PCD file holds.
+/// Content of a PCD file.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct PcdCloud {
     /// The points whose coordinates and intensity are finite, in the order of the file.
     pub points: PointCloud,
-    /// The green byte of `rgb` for each of `points`, where one is not zero: V2X-R labels weather clutter with it.
+    /// The green byte of `rgb` for each of `points`, if any is not zero: V2X-R labels weather clutter with it.
     pub labels: Option<Vec<u8>>,
-    /// How many points were left out because a number is NaN or infinite.
+    /// Number of points left out because a number is NaN or infinite.
     pub dropped: usize,
-    /// Where the first of these stands.
+    /// Position of the first of these.
     pub first_dropped: Option<Place>,
-    /// Where the intensities come from; `None` where the file has none, and 0 stands for all.
+    /// Source of the intensities; `None` if the file has none, and all are 0.
     pub intensity: Option<IntensityOrigin>,
-    /// Form of the file, for example `PCD` or `5 floats per point: x y z intensity ring`; empty where it is not known.
+    /// Form of the file, for example `PCD` or `5 floats per point: x y z intensity ring`; empty if it is unknown.
     pub form: &'static str,
 }
 
-/// Where the intensities of a sweep come from.
+/// Source of the intensities of a sweep.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct IntensityOrigin {
     /// Name of the field.
     pub field: String,
-    /// Number that the field stores, which tells its scale or leaves it open.
+    /// Type of the stored number, which may determine its scale.
     pub kind: IntensityKind,
-    /// Divisor that made the stored numbers what [`PcdCloud::points`] holds.
+    /// Divisor from the stored numbers to the values of [`PcdCloud::points`].
     pub divisor: f32,
 }
 
-/// Number that stores an intensity.
+/// Type of number that stores an intensity.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum IntensityKind {
@@ -68,11 +68,11 @@ pub enum IntensityKind {
     RedByte,
     /// A byte, 0..255.
     Byte,
-    /// A wider number, whose scale its type does not tell.
+    /// A wider number, whose type does not determine its scale.
     Number,
 }
 
-/// Where in a file.
+/// Position in a file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Place {
     /// A line, from 1.
@@ -81,15 +81,15 @@ pub enum Place {
     Point(u64),
 }
 
-/// Why bytes are no PCD file that can be read.
+/// Reasons why bytes are not a readable PCD file.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{}{}{reason}", line.map(|line| format!("line {line}: ")).unwrap_or_default(), field.as_ref().map(|field| format!("{field}: ")).unwrap_or_default())]
 pub struct PcdError {
-    /// The line at fault, from 1, where the fault is in text.
+    /// The line at fault, from 1, if the fault is in text.
     pub line: Option<u64>,
     /// The header key or the field of a point.
     pub field: Option<String>,
-    /// What was found and what was expected.
+    /// Found and expected value.
     pub reason: String,
 }
 
@@ -103,11 +103,10 @@ impl PcdError {
     }
 }
 
-/// Reads a PCD file that is in memory. Intensities are as the file stores them; the red byte of a colour is 0 to 1.
+/// Reads a PCD file in memory. Intensities are as the file stores them; the red byte of a colour is 0 to 1.
 ///
 /// # Errors
-/// [`PcdError`] names line, field and both values of what does not fit. Nothing is allocated on the word of the header
-/// alone.
+/// [`PcdError`] with line, field and both values of the fault. No allocation relies on the header alone.
 pub fn decode(bytes: &[u8]) -> Result<PcdCloud, PcdError> {
     let mut cloud = decode_stored(bytes)?;
     if let Some(origin) = cloud.intensity.as_mut().filter(|origin| origin.kind == IntensityKind::RedByte) {
@@ -117,7 +116,7 @@ pub fn decode(bytes: &[u8]) -> Result<PcdCloud, PcdError> {
     Ok(cloud)
 }
 
-/// [`decode`] with the red byte of a colour as it is stored too: 0 to 255.
+/// [`decode`] with the red byte of a colour as stored: 0 to 255.
 ///
 /// # Errors
 /// As [`decode`].
@@ -133,14 +132,14 @@ pub fn decode_stored(bytes: &[u8]) -> Result<PcdCloud, PcdError> {
 }
 
 impl IntensityOrigin {
-    /// A field whose numbers stand as they are stored.
+    /// A field whose numbers are used as stored.
     pub(crate) fn stored(field: &str, kind: IntensityKind) -> Self {
         Self { field: field.to_owned(), kind, divisor: 1.0 }
     }
 }
 
 impl PcdCloud {
-    /// Points without those that are not finite. `labels`: one for each point, or none.
+    /// Removes points that are not finite. `labels`: one for each point, or none.
     pub(crate) fn of_finite(mut points: Vec<[f32; 4]>, mut labels: Vec<u8>) -> Self {
         let is_finite = |point: &[f32; 4]| point.iter().all(|value| value.is_finite());
         let (all, first) = (points.len(), points.iter().position(|point| !is_finite(point)));

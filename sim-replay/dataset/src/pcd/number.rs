@@ -1,27 +1,27 @@
 //! Decimal numbers at the start of a text, as `f32`, bit by bit as the standard library parses them.
 //!
-//! Nearly all numbers of sweeps have a mantissa below 2^53 and a small exponent. Both are exact as `f64` then, so that one
-//! multiplication or division gives the nearest `f64`. Rounding that to `f32` is right unless it lies exactly in the middle
-//! of two; these numbers, and all unusual ones, are left to the standard library.
+//! Nearly all numbers of sweeps have a mantissa below 2^53 and a small exponent. Both are exact as `f64` then, so that
+//! one multiplication or division gives the nearest `f64`. Rounding that to `f32` is right unless it lies exactly
+//! halfway between two; these numbers, and all unusual ones, are left to the standard library.
 
 /// Powers of ten that are exact as `f64`.
 const EXACT_POWERS: [f64; 23] = [
     1e0, 1e1, 1e2, 1e3, 1e4, 1e5, 1e6, 1e7, 1e8, 1e9, 1e10, 1e11, 1e12, 1e13, 1e14, 1e15, 1e16, 1e17, 1e18, 1e19, 1e20,
     1e21, 1e22,
 ];
-/// Most digits of a number that surely fits `u64`.
+/// Largest number of digits that always fits `u64`.
 const MOST_DIGITS: usize = 19;
-/// Bits of an `f64` that an `f32` has not.
+/// Bits of an `f64` beyond the precision of an `f32`.
 const LOST_BITS: u64 = (1 << 29) - 1;
-/// What they are in the middle of two `f32`.
+/// Value of these bits halfway between two `f32`.
 const MIDDLE: u64 = 1 << 28;
 
-/// Whether a byte ends a token: whitespace and control characters.
+/// True if a byte ends a token: whitespace and control characters.
 pub(super) fn is_separator(byte: u8) -> bool {
     byte <= b' '
 }
 
-/// The number of a token at the start of `text` and the token's length, where the number is an ordinary one.
+/// The number of a token at the start of `text` and the token's length, if the number is an ordinary one.
 pub(super) fn ordinary(text: &[u8]) -> Option<(f32, usize)> {
     let is_negative = text.first() == Some(&b'-');
     let mut mantissa = Digits { value: 0, at: usize::from(is_negative) };
@@ -51,7 +51,7 @@ pub(super) fn ordinary(text: &[u8]) -> Option<(f32, usize)> {
     Some((exact(is_negative, mantissa.value, exponent)?, at))
 }
 
-/// The value where `f64` tells it for sure.
+/// The value if `f64` determines it exactly.
 fn exact(is_negative: bool, mantissa: u64, exponent: i32) -> Option<f32> {
     if mantissa >= 1 << 53 {
         return None;
@@ -65,7 +65,7 @@ fn exact(is_negative: bool, mantissa: u64, exponent: i32) -> Option<f32> {
     Some(value as f32)
 }
 
-/// The exponent from `at` on and where it ends.
+/// The exponent from `at` on and its end.
 fn exponent_of(text: &[u8], at: usize) -> Option<(i32, usize)> {
     let sign = text.get(at).filter(|byte| matches!(byte, b'-' | b'+'));
     let mut digits = Digits { value: 0, at: at + usize::from(sign.is_some()) };
@@ -78,7 +78,7 @@ fn exponent_of(text: &[u8], at: usize) -> Option<(i32, usize)> {
     Some((if sign == Some(&b'-') { -value } else { value }, digits.at))
 }
 
-/// Digits that were read, as a number, and where they end. More than fit overflow; their count tells.
+/// Digits as a number, and their end. More digits than fit overflow; their count shows it.
 struct Digits {
     value: u64,
     at: usize,
@@ -114,7 +114,7 @@ fn eight_digits(bytes: &[u8; 8]) -> Option<u64> {
     Some((fours * 10_000 + (fours >> 32)) & 0xffff_ffff)
 }
 
-/// The number of a token that is no ordinary one: more digits, far exponents, subnormal, infinite or no number, in the
+/// The number of a token that is not ordinary: more digits, large exponents, subnormal, infinite or NaN, in the
 /// spellings of C libraries too (`-nan`, `nan(ind)`, `1.#QNAN`).
 pub(super) fn unusual(token: &[u8]) -> Option<f32> {
     let text = std::str::from_utf8(token).ok()?;
@@ -136,7 +136,7 @@ mod tests {
 
     use super::*;
 
-    /// What the standard library makes of the token, if the fast way takes it.
+    /// Compares with the standard library, if the fast path accepts the token.
     fn check(token: &str) {
         for behind in ["", " 7", "\n", "\r\n", "\t"] {
             if let Some((number, len)) = ordinary(format!("{token}{behind}").as_bytes()) {
@@ -195,7 +195,7 @@ mod tests {
     }
 
     #[test]
-    fn c_libraries_spell_what_is_no_number_in_many_ways() {
+    fn c_libraries_have_many_spellings_of_nan() {
         for nan in ["nan", "-nan", "NaN", "nan(ind)", "-nan(0x8000)", "1.#QNAN", "-1.#IND", "1.#QNAN0"] {
             assert!(unusual(nan.as_bytes()).unwrap().is_nan(), "{nan}");
         }

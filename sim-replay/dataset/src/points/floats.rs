@@ -1,24 +1,24 @@
-//! Sweeps of little-endian `f32`, point after point: `x y z intensity`, or a fifth number behind these.
+//! Sweeps of little-endian `f32`, point after point: `x y z intensity`, or a fifth number after these.
 //!
-//! Nothing in such a file tells how many numbers a point has. The first sweeps of an agent do: read by the right number,
-//! neighbouring points resemble each other, and the fifth number mostly is a laser's.
+//! Such a file does not record the number of floats per point. The first sweeps of an agent determine it: with the
+//! right number, neighbouring points resemble each other, and the fifth number mostly is a laser index.
 
 use super::plausibility::TINY;
 use crate::pcd::{IntensityKind, IntensityOrigin, PcdCloud};
 
-/// Fewer points than this tell nothing.
+/// Least number of points of a sample.
 const LEAST_POINTS: usize = 8;
-/// Numbers of a sample that are looked at.
+/// Largest number of floats of a sample that are used.
 const MOST_NUMBERS: usize = 200_000;
-/// Largest share of numbers that no sensor writes.
+/// Largest share of implausible numbers.
 const ABSURD_SHARE: f64 = 0.05;
-/// Number beyond which nothing is a coordinate or an intensity.
+/// Largest plausible coordinate or intensity.
 const LARGEST: f32 = 1e7;
-/// Least share of whole numbers from 0 to 255 in a column of lasers.
+/// Least share of whole numbers from 0 to 255 in a column of laser indices.
 const LASER_SHARE: f64 = 0.99;
-/// Numbers per point that files may have and that are not read.
+/// Unsupported numbers of floats per point that are detected.
 const OTHER_NUMBERS: [usize; 3] = [3, 6, 7];
-/// How much less unlike neighbours must be with these.
+/// Factor by which these must reduce the difference of neighbours.
 const MUCH_LESS: f64 = 0.5;
 
 /// Numbers per point.
@@ -26,7 +26,7 @@ const MUCH_LESS: f64 = 0.5;
 pub(super) enum FloatForm {
     /// x, y, z, intensity.
     Four,
-    /// x, y, z, intensity, and the laser's number or whatever else.
+    /// x, y, z, intensity, and the laser index or another value.
     Five,
 }
 
@@ -46,7 +46,7 @@ impl FloatForm {
         }
     }
 
-    /// Decides by samples, of which each has a vote. Without any that tells it: four.
+    /// Majority vote of the samples; four if none decides.
     pub(super) fn of(samples: &[Vec<u8>]) -> Result<Self, String> {
         let votes: Vec<Result<Self, String>> = samples.iter().filter_map(|bytes| Self::of_sample(bytes)).collect();
         let count = |form| votes.iter().filter(|vote| **vote == Ok(form)).count();
@@ -57,7 +57,7 @@ impl FloatForm {
         }
     }
 
-    /// `None` where the sample is empty or cut off, and says nothing.
+    /// `None` if the sample is empty or truncated, and decides nothing.
     fn of_sample(bytes: &[u8]) -> Option<Result<Self, String>> {
         let (numbers, rest) = bytes.as_chunks::<4>();
         let fits = |form: &Self| rest.is_empty() && numbers.len().is_multiple_of(form.numbers());
@@ -86,7 +86,7 @@ impl FloatForm {
         })
     }
 
-    /// Takes the points out of a file of whole points.
+    /// Extracts the points of a file of whole points.
     pub(super) fn points(self, bytes: &[u8]) -> PcdCloud {
         let (numbers, _) = bytes.as_chunks::<4>();
         let points = numbers.chunks_exact(self.numbers());
@@ -96,7 +96,7 @@ impl FloatForm {
     }
 }
 
-/// What no sensor writes, if it is in more than a few of the numbers.
+/// Description of implausible numbers, if there are more than a few.
 fn absurd(numbers: &[f32]) -> Option<String> {
     let is_absurd = |number: f32| number.abs() > LARGEST || (number != 0.0 && number.abs() < TINY);
     let share = numbers.iter().filter(|&&number| is_absurd(number)).count() as f64 / numbers.len() as f64;
@@ -104,14 +104,14 @@ fn absurd(numbers: &[f32]) -> Option<String> {
     (share > ABSURD_SHARE).then(fault)
 }
 
-/// Whether every fifth number is a laser's, and not all numbers could be.
+/// True if every fifth number is a laser index, and not all numbers could be.
 fn has_lasers(numbers: &[f32]) -> bool {
     let is_laser = |number: f32| (0.0..=255.0).contains(&number) && number.fract() == 0.0;
     let lasers = numbers.chunks_exact(5).filter(|point| is_laser(point[4])).count();
     lasers as f64 >= LASER_SHARE * (numbers.len() / 5) as f64 && numbers.iter().any(|number| number.fract() != 0.0)
 }
 
-/// How little each number resembles the one `step` later. Logarithms, so that no column outweighs the others.
+/// Mean difference of each number from the one `step` later. Logarithms, so that no column dominates the others.
 fn unlikeness(numbers: &[f32], step: usize) -> f64 {
     let log = |number: f32| f64::from(number.abs().ln_1p().copysign(number));
     let pairs = numbers.iter().zip(&numbers[step..]);

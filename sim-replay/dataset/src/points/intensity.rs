@@ -1,8 +1,8 @@
-//! Scale of intensities: the one place that knows each source's. Everything behind it has 0 to 1.
+//! Scale of intensities of each source, normalised to 0 to 1.
 //!
-//! The red byte of a colour and a byte are divided by 255. A wider number does not tell its scale; the largest of the
-//! agent's first sweeps does: up to 1 it stays as it is, up to 255 it is divided by 255, and beyond that by the smallest
-//! 2^n - 1 that holds it, of which [`sim_replay::inspect`] speaks as a problem.
+//! The red byte of a colour and a byte are divided by 255. The type of a wider number does not determine its scale; the
+//! largest value of the agent's first sweeps does: up to 1 it stays as it is, up to 255 it is divided by 255, and
+//! beyond that by the smallest 2^n - 1 that holds it, which `sim_replay::inspect` reports as a problem.
 
 use std::fmt;
 use std::str::FromStr;
@@ -26,7 +26,7 @@ pub struct IntensityScale {
 // Never NaN.
 impl Eq for IntensityScale {}
 
-/// Why a text is no [`IntensityScale`].
+/// Reasons why a text is no [`IntensityScale`].
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{0:?}, expected auto or a positive number that intensities are divided by, for example 1 or 255")]
 pub struct IntensityScaleError(String);
@@ -70,7 +70,7 @@ impl IntensityScale {
     /// By the type of the field, or by the range of the agent's first sweeps.
     pub const AUTO: Self = Self { divisor: None };
 
-    /// Divides what a file stores. `by_range` gives the divisor of numbers whose type does not tell their scale.
+    /// Divides the stored values. `by_range` gives the divisor of numbers whose type does not determine their scale.
     pub(super) fn apply(self, cloud: &mut PcdCloud, by_range: impl FnOnce() -> f32) {
         let Some(origin) = &mut cloud.intensity else { return };
         origin.divisor = match (self.divisor, origin.kind) {
@@ -86,7 +86,7 @@ impl IntensityScale {
     }
 }
 
-/// Divisor of numbers of which `largest` is the largest.
+/// Divisor for numbers with the maximum `largest`.
 pub(super) fn divisor_of_range(largest: f32) -> f32 {
     if largest <= 1.0 {
         return 1.0;
@@ -111,7 +111,7 @@ mod tests {
     }
 
     #[test]
-    fn the_type_or_the_range_tells_the_scale() {
+    fn the_type_or_the_range_determines_the_scale() {
         let auto = |kind, stored| scaled(IntensityScale::AUTO, kind, stored);
         assert_eq!(auto(IntensityKind::RedByte, 194.0), (194.0 / 255.0, 255.0));
         assert_eq!(auto(IntensityKind::Byte, 1.0), (1.0 / 255.0, 255.0));

@@ -1,4 +1,4 @@
-//! Plausibility of a sweep: figures that real sweeps keep within limits, and what is read wrongly does not.
+//! Plausibility of a sweep: limits that real sweeps keep and wrongly decoded ones exceed.
 
 use protocol::PointCloud;
 
@@ -6,7 +6,7 @@ use protocol::PointCloud;
 const RANGE_M: f32 = 300.0;
 /// Least share of the points within that range.
 const WITHIN_RANGE: f64 = 0.95;
-/// Largest share of the points exactly at the origin; sensors write rays that met nothing so.
+/// Largest share of the points exactly at the origin; sensors write rays without a hit so.
 const AT_ORIGIN: f64 = 0.5;
 /// Magnitude below which only zero itself is a coordinate: integers read as floats lie there.
 pub(super) const TINY: f32 = 1e-30;
@@ -34,7 +34,7 @@ impl Plausibility {
         self.points += cloud.len();
     }
 
-    /// Adds what was counted elsewhere.
+    /// Adds the counts of another sweep.
     pub fn join(&mut self, other: &Self) {
         self.points += other.points;
         self.beyond_range += other.beyond_range;
@@ -42,7 +42,7 @@ impl Plausibility {
         self.tiny += other.tiny;
     }
 
-    /// The first figure that no sweep has, and the usual one.
+    /// The first exceeded limit, and the usual value.
     pub fn fault(&self) -> Option<String> {
         let of = |count: usize, all: usize| count as f64 / all.max(1) as f64;
         let percent = |share: f64| format!("{:.1} %", 100.0 * share);

@@ -53,7 +53,7 @@ fn a_cut_file_and_a_nan_are_named() {
     assert_eq!((cloud.points.len(), cloud.dropped, cloud.first_dropped), (1, 1, Some(Place::Point(1))));
 }
 
-/// Points all round as a LiDAR of 32 lasers sees them, with any numbers behind x, y, z.
+/// Points all round like those of a LiDAR of 32 lasers, with any numbers after x, y, z.
 fn turn(points: usize, behind: impl Fn(usize) -> Vec<f32>) -> Vec<u8> {
     let point = |index: usize| {
         let (angle, range) = (index as f32 * 0.37, 5.0 + (index * 7919 % 400) as f32 * 0.1);
@@ -72,7 +72,7 @@ const FOUR: &str = "4 floats per point: x y z intensity";
 const FIVE: &str = "5 floats per point: x y z intensity ring";
 
 #[test]
-fn four_and_five_floats_are_told_apart_also_where_both_fit() {
+fn four_and_five_floats_are_distinguished_also_if_both_fit() {
     let intensity = |index: usize| (index % 101) as f32 / 100.0;
     // 40 points of 20 bytes are 50 of 16.
     for points in [40, 400, 41, 35_000] {
@@ -105,7 +105,7 @@ fn the_first_sweeps_decide_for_all() {
 }
 
 #[test]
-fn what_is_neither_is_refused_with_the_figure() {
+fn other_forms_are_refused_with_the_figure() {
     let doubles: Vec<u8> = (0..400).flat_map(|index| (f64::from(index) * 0.317 - 60.0).to_le_bytes()).collect();
     let integers: Vec<u8> = (0..800_u32).flat_map(|index| (index % 500).to_le_bytes()).collect();
     for bytes in [doubles, integers] {

@@ -1,4 +1,4 @@
-//! A node together with its place: typed access for readers, with errors that name file, line and field.
+//! A YAML node with its position: typed access for readers, with errors that give file, line and field.
 
 use std::path::Path;
 
@@ -6,9 +6,9 @@ use super::{Node, Value};
 use crate::ReadError;
 use crate::numpy_tags::{self, NumpyArray};
 
-/// A node together with where it was found: what readers take values from.
+/// A node with its position in the document; readers take values from it.
 ///
-/// Wherever numbers stand, NumPy's pickled arrays and scalars are read as well ([`numpy_tags`]).
+/// NumPy's pickled arrays and scalars are read in place of any number ([`numpy_tags`]).
 #[derive(Debug, Clone)]
 pub(crate) struct Field<'a> {
     path: &'a Path,
@@ -27,7 +27,7 @@ impl<'a> Field<'a> {
         self.node
     }
 
-    /// The file it stands in.
+    /// The file of the node.
     pub(crate) fn path(&self) -> &'a Path {
         self.path
     }
@@ -47,7 +47,7 @@ impl<'a> Field<'a> {
         }
     }
 
-    /// An error that names what was found and what was expected.
+    /// An error with the found and the expected value.
     pub(crate) fn expected(&self, what: &str) -> ReadError {
         self.error(format!("{}, expected {what}", self.found()))
     }
@@ -77,24 +77,24 @@ impl<'a> Field<'a> {
         }
     }
 
-    /// True where a map has the key, whatever its value.
+    /// True if a map has the key, with any value.
     pub(crate) fn has(&self, key: &str) -> bool {
         matches!(&self.node.value, Value::Map(entries) if entries.iter().any(|(found, _)| found == key))
     }
 
-    /// An entry that may be missing or null. Of equal keys the last counts, as in Python.
+    /// An entry that may be missing or null. Of equal keys the last is used, as in Python.
     pub(crate) fn optional(&self, key: &str) -> Result<Option<Self>, ReadError> {
         let Value::Map(entries) = &self.node.value else { return Err(self.expected("a map")) };
         let found = entries.iter().rfind(|(found, node)| found == key && node.value != Value::Null);
         Ok(found.map(|(_, node)| self.child(key, node)))
     }
 
-    /// An entry that must be there.
+    /// A required entry.
     pub(crate) fn required(&self, key: &str) -> Result<Self, ReadError> {
         self.optional(key)?.ok_or_else(|| self.child(key, self.node).error("missing"))
     }
 
-    /// A finite number, written in whatever way.
+    /// A finite number, in any notation.
     pub(crate) fn number(&self) -> Result<f64, ReadError> {
         if numpy_tags::is_python(self.node) && !matches!(self.node.value, Value::Text(_)) {
             return numpy_tags::scalar(self);
@@ -147,7 +147,7 @@ impl<'a> Field<'a> {
         Ok(numbers)
     }
 
-    /// Numbers of whatever shape: a list, a list of equally long rows, or an array.
+    /// Numbers in any form: a list, a list of equally long rows, or an array.
     pub(crate) fn array(&self) -> Result<NumpyArray, ReadError> {
         let items = match &self.node.value {
             Value::List(items) if !numpy_tags::is_call(self.node) => items,

@@ -1,7 +1,7 @@
-//! YAML as a tree that remembers lines and tags, so that whatever is wrong can be named by file, line and field.
+//! YAML as a tree with lines and tags, so that errors give file, line and field.
 //!
-//! Tags are kept as text and never acted upon. What a document may cost is limited: its size, its depth, its nodes, and how
-//! often aliases may repeat its parts.
+//! Tags are kept as text and never acted upon. The cost of a document is limited: its size, its depth, its nodes, and
+//! the repetitions of its parts by aliases.
 
 mod field;
 mod scalar;
@@ -36,7 +36,7 @@ pub(super) enum Value {
     Float(f64),
     Text(String),
     List(Vec<Node>),
-    /// In the order of the file; keys as written.
+    /// Entries in the order of the file; keys as written.
     Map(Vec<(String, Node)>),
 }
 
@@ -130,7 +130,7 @@ mod tests {
     }
 
     #[test]
-    fn broken_yaml_is_named_with_line_and_reason_alone() {
+    fn broken_yaml_is_reported_with_line_and_reason_only() {
         let error = parse(Path::new("a.yaml"), b"a: 1\nb: [1, 2\nc: 3\n").unwrap_err();
         assert!(error.line().is_some_and(|line| line > 1), "{error}");
         let text = error.to_string();
@@ -157,7 +157,7 @@ mod tests {
     }
 
     #[test]
-    fn merged_maps_give_what_is_not_there() {
+    fn merged_maps_give_missing_entries() {
         let node = parsed("base: &b {x: 1, y: 2}\na:\n  <<: *b\n  x: 3\n");
         let a = Field::root(Path::new("a.yaml"), &node).required("a").unwrap();
         let value = |key: &str| a.required(key).unwrap().integer().unwrap();
@@ -176,7 +176,7 @@ mod tests {
             aliases += &format!("a{level}: &a{level} [{repeats}]\n");
         }
         assert!(refused(&aliases).contains("aliases repeat more than 200000 nodes"));
-        assert!(refused("a: &a [*a]\n").contains("an alias within what it stands for"));
+        assert!(refused("a: &a [*a]\n").contains("an alias within its own anchor"));
     }
 
     proptest! {

@@ -1,4 +1,4 @@
-//! Resolution of scalars: which text is a number, a truth value or nothing, by YAML 1.2's core schema.
+//! Resolution of scalars: number, boolean, null or text, by YAML 1.2's core schema.
 
 use super::Value;
 
@@ -36,7 +36,7 @@ fn number(text: &str) -> Option<Value> {
     if let Some(digits) = text.strip_prefix("0o") {
         return i64::from_str_radix(digits, 8).map(Value::Integer).ok();
     }
-    // Rust would take `1_0` for none and `infinity` for a number: letters other than the exponent's are no number's.
+    // Letters other than the exponent are rejected: Rust would parse `infinity` too. It parses no `1_0`.
     let is_decimal = |byte: u8| byte.is_ascii_digit() || matches!(byte, b'+' | b'-' | b'.' | b'e' | b'E');
     text.bytes().all(is_decimal).then(|| text.parse().map(Value::Float).ok()).flatten()
 }
@@ -46,7 +46,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn scalars_are_what_the_core_schema_makes_of_them() {
+    fn scalars_follow_the_core_schema() {
         for (text, expected) in [
             ("", Value::Null),
             ("~", Value::Null),

@@ -9,9 +9,9 @@ use crate::numpy_tags;
 
 /// Deepest nesting.
 const MAX_DEPTH: usize = 64;
-/// Most nodes of a document without those that aliases repeat. A frame has about a thousand.
+/// Most nodes of a document, excluding those repeated by aliases. A frame has about a thousand.
 const MAX_NODES: usize = 500_000;
-/// How many nodes all aliases of a document together may stand for.
+/// Most nodes repeated by all aliases of a document together.
 const MAX_ALIASED_NODES: usize = 200_000;
 /// YAML's own prefix of tags, written `!!`.
 const TAG_PREFIX: &str = "tag:yaml.org,2002:";
@@ -39,7 +39,7 @@ struct Builder<'t> {
     parser: Parser<'t, StrInput<'t>>,
     /// The line of the last event, from 1.
     line: u64,
-    /// What aliases stand for, with its number of nodes.
+    /// Targets of aliases, with their numbers of nodes.
     anchors: HashMap<usize, (Node, usize)>,
     nodes: usize,
     aliased: usize,
@@ -152,7 +152,7 @@ impl<'t> Builder<'t> {
         self.count_aliased(size.unwrap_or(0))?;
         match self.anchors.get(&anchor) {
             Some((node, _)) => Ok(Node { line, ..node.clone() }),
-            None => Err(self.unsound("an alias within what it stands for")),
+            None => Err(self.unsound("an alias within its own anchor")),
         }
     }
 

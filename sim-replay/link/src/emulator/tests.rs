@@ -7,7 +7,7 @@ use super::*;
 
 const MS: u64 = 1_000_000;
 
-fn parcel(from: &str, sequence: u64, bytes: u64, offered_nanos: u64) -> Packet {
+fn packet(from: &str, sequence: u64, bytes: u64, offered_nanos: u64) -> Packet {
     let cav = |name: &str| CavId::new(name).unwrap();
     Packet {
         id: sequence,
@@ -25,14 +25,14 @@ fn shaped(rate_mbps: f64) -> LinkConfig {
     LinkConfig { capacity: CapacityConfig::TokenBucket { rate_mbps, burst_bytes: 0 }, ..LinkConfig::default() }
 }
 
-fn air(config: &LinkConfig) -> LinkEmulator {
+fn emulator(config: &LinkConfig) -> LinkEmulator {
     LinkEmulator::new(config.clone(), Path::new("."), 5).unwrap()
 }
 
-fn all(config: &LinkConfig, parcels: impl IntoIterator<Item = Packet>) -> Vec<Outcome> {
-    let mut air = air(config);
-    parcels.into_iter().for_each(|parcel| air.offer(parcel));
-    air.advance(u64::MAX / 4)
+fn all(config: &LinkConfig, packets: impl IntoIterator<Item = Packet>) -> Vec<Outcome> {
+    let mut emulator = emulator(config);
+    packets.into_iter().for_each(|packet| emulator.offer(packet));
+    emulator.advance(u64::MAX / 4)
 }
 
 fn times_ms(outcomes: &[Outcome]) -> Vec<(u64, u64, Delivery)> {
@@ -43,7 +43,7 @@ const ARRIVED: Delivery = Delivery::Arrived { is_copy: false, is_repeated: false
 
 #[test]
 fn an_ideal_link_delivers_at_once_and_in_order() {
-    let outcomes = all(&LinkConfig::default(), (0..5).map(|k| parcel("a", k, 1 << 20, 7 * MS)));
+    let outcomes = all(&LinkConfig::default(), (0..5).map(|k| packet("a", k, 1 << 20, 7 * MS)));
     assert_eq!(times_ms(&outcomes), (0..5).map(|k| (k, 7, ARRIVED)).collect::<Vec<_>>());
 }
 
@@ -51,10 +51,10 @@ fn an_ideal_link_delivers_at_once_and_in_order() {
 fn messages_queue_behind_each_other() {
     // 8 Mbit/s: 1,000 bytes a millisecond.
     let outcomes =
-        all(&shaped(8.0), [parcel("a", 0, 20_000, 0), parcel("a", 1, 20_000, 0), parcel("a", 2, 20_000, 90 * MS)]);
+        all(&shaped(8.0), [packet("a", 0, 20_000, 0), packet("a", 1, 20_000, 0), packet("a", 2, 20_000, 90 * MS)]);
     assert_eq!(times_ms(&outcomes), [(0, 20, ARRIVED), (1, 40, ARRIVED), (2, 110, ARRIVED)]);
-    // Every pair has a link of its own, unless the medium is shared.
-    let both = [parcel("a", 0, 20_000, 0), parcel("b", 1, 20_000, 0)];
+    // Every pair has its own link, unless the medium is shared.
+    let both = [packet("a", 0, 20_000, 0), packet("b", 1, 20_000, 0)];
     assert_eq!(times_ms(&all(&shaped(8.0), both.clone())), [(0, 20, ARRIVED), (1, 20, ARRIVED)]);
     let shared = LinkConfig { medium: Medium::Shared, ..shaped(8.0) };
     assert_eq!(times_ms(&all(&shared, both)), [(0, 20, ARRIVED), (1, 40, ARRIVED)]);
@@ -63,25 +63,25 @@ fn messages_queue_behind_each_other() {
 #[test]
 fn small_messages_do_not_wait_and_cost_their_time() {
     let outcomes =
-        all(&shaped(8.0), [parcel("a", 0, 20_000, 0), parcel("a", 1, 1_000, 5 * MS), parcel("a", 2, 1_000, 5 * MS)]);
+        all(&shaped(8.0), [packet("a", 0, 20_000, 0), packet("a", 1, 1_000, 5 * MS), packet("a", 2, 1_000, 5 * MS)]);
     assert_eq!(times_ms(&outcomes), [(1, 6, ARRIVED), (2, 7, ARRIVED), (0, 22, ARRIVED)]);
 }
 
 #[test]
 fn a_full_queue_drops_the_newcomer_or_the_oldest() {
-    let parcels = || (0..4).map(|k| parcel("a", k, 20_000, k * MS));
+    let packets = || (0..4).map(|k| packet("a", k, 20_000, k * MS));
     let dropped = Delivery::Dropped(DropReason::LinkQueue);
     let queue = QueueConfig { bytes: 40_000, ..QueueConfig::default() };
     let tail = LinkConfig { queue, ..shaped(8.0) };
     let expected = [(3, 3, dropped), (0, 20, ARRIVED), (1, 40, ARRIVED), (2, 60, ARRIVED)];
-    assert_eq!(times_ms(&all(&tail, parcels())), expected);
+    assert_eq!(times_ms(&all(&tail, packets())), expected);
     let head = LinkConfig { queue: QueueConfig { drop: QueueDrop::Head, ..queue }, ..shaped(8.0) };
     let expected = [(1, 3, dropped), (0, 20, ARRIVED), (2, 40, ARRIVED), (3, 60, ARRIVED)];
-    assert_eq!(times_ms(&all(&head, parcels())), expected);
+    assert_eq!(times_ms(&all(&head, packets())), expected);
     let newest = LinkConfig { queue: QueueConfig { keep_newest: true, ..queue }, ..shaped(8.0) };
     let superseded = Delivery::Dropped(DropReason::Superseded);
     let expected = [(1, 2, superseded), (2, 3, superseded), (0, 20, ARRIVED), (3, 40, ARRIVED)];
-    assert_eq!(times_ms(&all(&newest, parcels())), expected);
+    assert_eq!(times_ms(&all(&newest, packets())), expected);
 }
 
 #[test]
@@ -93,7 +93,7 @@ fn the_long_run_rate_is_the_rate_and_the_burst_comes_once() {
             queue: QueueConfig { bytes: u64::MAX, ..QueueConfig::default() },
             ..LinkConfig::default()
         };
-        let outcomes = all(&config, (0..2000).map(|k| parcel("a", k, bytes, 1_000 * MS + k * MS)));
+        let outcomes = all(&config, (0..2000).map(|k| packet("a", k, bytes, 1_000 * MS + k * MS)));
         let span_s = (outcomes[1999].nanos - 1_000 * MS) as f64 * 1e-9;
         let rate = (2000 * bytes - burst_bytes) as f64 * 8e-6 / span_s;
         assert!((rate - rate_mbps).abs() < 0.01 * rate_mbps, "{rate} Mbit/s with a burst of {burst_bytes}");
@@ -103,18 +103,18 @@ fn the_long_run_rate_is_the_rate_and_the_burst_comes_once() {
 }
 
 #[test]
-fn outages_lose_what_is_on_its_way() {
+fn outages_lose_packets_in_flight() {
     let config = LinkConfig { outages: vec![Outage { from_s: 0.05, to_s: 0.1 }], ..shaped(8.0) };
     let lost = Delivery::Dropped(DropReason::LinkLoss);
-    let parcels = [parcel("a", 0, 20_000, 0), parcel("a", 1, 20_000, 40 * MS), parcel("a", 2, 20_000, 110 * MS)];
-    assert_eq!(times_ms(&all(&config, parcels)), [(0, 20, ARRIVED), (1, 60, lost), (2, 130, ARRIVED)]);
+    let packets = [packet("a", 0, 20_000, 0), packet("a", 1, 20_000, 40 * MS), packet("a", 2, 20_000, 110 * MS)];
+    assert_eq!(times_ms(&all(&config, packets)), [(0, 20, ARRIVED), (1, 60, lost), (2, 130, ARRIVED)]);
 }
 
 #[test]
 fn delays_are_cut_down_to_whole_frames_as_in_opencood() {
     // 1.06 Mbit, as in OpenCOOD's configuration.
     let config = LinkConfig::preset("opencood-real").unwrap();
-    let outcomes = all(&config, (0..2000).map(|k| parcel("a", k, 132_500, k * 100 * MS)));
+    let outcomes = all(&config, (0..2000).map(|k| packet("a", k, 132_500, k * 100 * MS)));
     let frames = |count: u64| {
         let late = |outcome: &&Outcome| outcome.nanos - outcome.parcel.offered_nanos == count * 100 * MS;
         outcomes.iter().filter(late).count()
@@ -128,7 +128,7 @@ fn delays_are_cut_down_to_whole_frames_as_in_opencood() {
             floor_ms: 100.0,
             ..LinkConfig::default()
         };
-        let outcomes = all(&config, [parcel("a", 0, 10, 7 * MS)]);
+        let outcomes = all(&config, [packet("a", 0, 10, 7 * MS)]);
         assert_eq!(outcomes[0].nanos, (7 + delay_ms) * MS);
     }
 }
@@ -137,7 +137,7 @@ fn delays_are_cut_down_to_whole_frames_as_in_opencood() {
 fn jitter_reorders_unless_order_is_kept() {
     let jitter = LinkConfig { delay: DelayModel::UniformMs([0.0, 50.0]), ..LinkConfig::default() };
     let order = |config: &LinkConfig| -> Vec<u64> {
-        all(config, (0..200).map(|k| parcel("a", k, 10, k * MS)))
+        all(config, (0..200).map(|k| packet("a", k, 10, k * MS)))
             .iter()
             .map(|outcome| outcome.parcel.sequence)
             .collect()
@@ -150,7 +150,7 @@ fn jitter_reorders_unless_order_is_kept() {
 }
 
 #[test]
-fn a_link_does_not_care_what_other_links_carry() {
+fn a_link_is_independent_of_other_links() {
     let config = LinkConfig {
         delay: DelayModel::Normal { mean_ms: 20.0, std_ms: 8.0 },
         loss: LossModel::Bernoulli(0.2),
@@ -160,20 +160,20 @@ fn a_link_does_not_care_what_other_links_carry() {
     let of_a = |outcomes: Vec<Outcome>| -> Vec<Outcome> {
         outcomes.into_iter().filter(|outcome| outcome.parcel.from.as_str() == "a").collect()
     };
-    let alone = of_a(all(&config, (0..300).map(|k| parcel("a", k, 40_000, k * 10 * MS))));
-    let together = (0..300).flat_map(|k| ["b", "a", "c"].map(|from| parcel(from, k, 40_000, k * 10 * MS)));
-    assert_eq!(of_a(all(&config, together)), alone);
-    let other_seed = LinkEmulator::new(config, Path::new("."), 6).map(|mut air| {
-        (0..300).for_each(|k| air.offer(parcel("a", k, 40_000, k * 10 * MS)));
-        air.advance(u64::MAX / 4)
+    let single = of_a(all(&config, (0..300).map(|k| packet("a", k, 40_000, k * 10 * MS))));
+    let together = (0..300).flat_map(|k| ["b", "a", "c"].map(|from| packet(from, k, 40_000, k * 10 * MS)));
+    assert_eq!(of_a(all(&config, together)), single);
+    let other_seed = LinkEmulator::new(config, Path::new("."), 6).map(|mut emulator| {
+        (0..300).for_each(|k| emulator.offer(packet("a", k, 40_000, k * 10 * MS)));
+        emulator.advance(u64::MAX / 4)
     });
-    assert_ne!(other_seed.unwrap(), alone);
+    assert_ne!(other_seed.unwrap(), single);
 }
 
 proptest! {
     #![proptest_config(ProptestConfig { cases: 64, ..ProptestConfig::default() })]
     #[test]
-    fn every_parcel_has_one_fate_and_steps_change_nothing(
+    fn every_packet_has_one_outcome_and_steps_change_nothing(
         sizes in prop::collection::vec((1_u64..80_000, 0_u64..30), 1..60), bytes in 1_u64..200_000, drop_head in any::<bool>(),
         keep_newest in any::<bool>(), shared in any::<bool>(), steps in prop::collection::vec(0_u64..4_000, 0..20),
     ) {
@@ -187,31 +187,31 @@ proptest! {
             ..shaped(6.0)
         };
         let mut offered_nanos = 0;
-        let parcels: Vec<Packet> = sizes.iter().enumerate().map(|(k, &(bytes, gap_ms))| {
+        let packets: Vec<Packet> = sizes.iter().enumerate().map(|(k, &(bytes, gap_ms))| {
             offered_nanos += gap_ms * MS;
-            parcel(if k % 3 == 0 { "b" } else { "a" }, k as u64, bytes, offered_nanos)
+            packet(if k % 3 == 0 { "b" } else { "a" }, k as u64, bytes, offered_nanos)
         }).collect();
-        let outcomes = all(&config, parcels.clone());
+        let outcomes = all(&config, packets.clone());
         prop_assert!(outcomes.is_sorted_by_key(|outcome| outcome.nanos));
         prop_assert!(outcomes.iter().all(|outcome| outcome.nanos >= outcome.parcel.offered_nanos));
         let first = outcomes.iter().filter(|outcome| !matches!(outcome.fate, Delivery::Arrived { is_copy: true, .. }));
         let first: Vec<u64> = first.map(|outcome| outcome.parcel.sequence).collect();
         let unique: BTreeSet<u64> = first.iter().copied().collect();
-        prop_assert_eq!((first.len(), unique.len()), (parcels.len(), parcels.len()));
+        prop_assert_eq!((first.len(), unique.len()), (packets.len(), packets.len()));
 
         // The same in many small steps.
-        let mut air = air(&config);
+        let mut emulator = emulator(&config);
         let mut steps: Vec<u64> = steps.iter().map(|ms| ms * MS).collect();
         steps.sort_unstable();
         let mut stepped = Vec::new();
-        let mut parcels = parcels.into_iter().peekable();
+        let mut packets = packets.into_iter().peekable();
         for step in steps.into_iter().chain([u64::MAX / 4]) {
-            while let Some(parcel) = parcels.next_if(|parcel| parcel.offered_nanos <= step) {
-                air.offer(parcel);
+            while let Some(packet) = packets.next_if(|packet| packet.offered_nanos <= step) {
+                emulator.offer(packet);
             }
-            stepped.extend(air.advance(step));
+            stepped.extend(emulator.advance(step));
         }
-        prop_assert_eq!(air.next_nanos(), None);
+        prop_assert_eq!(emulator.next_nanos(), None);
         prop_assert_eq!(stepped, outcomes);
     }
 }

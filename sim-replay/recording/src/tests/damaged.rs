@@ -6,7 +6,7 @@ use proptest::prelude::*;
 
 use super::*;
 
-/// The same messages as another program writes them.
+/// The same messages as written by another program.
 fn rewritten(recording: &Recording, options: WriteOptions) -> Vec<u8> {
     let mut bytes = std::io::Cursor::new(Vec::new());
     let mut writer = options.create(&mut bytes).unwrap();
@@ -18,7 +18,7 @@ fn rewritten(recording: &Recording, options: WriteOptions) -> Vec<u8> {
     bytes.into_inner()
 }
 
-/// Packed by lz4, some messages a chunk.
+/// Compressed by lz4, some messages per chunk.
 fn lz4() -> WriteOptions {
     WriteOptions::new().compression(Some(Compression::Lz4)).chunk_size(Some(2_000))
 }
@@ -46,7 +46,7 @@ fn a_recording_that_another_program_has_rewritten_is_read_alike() {
     }
 }
 
-/// Where the chunks of a file begin.
+/// Starts of the chunks of a file.
 fn chunk_places(bytes: &[u8]) -> Vec<usize> {
     let mut at = mcap::MAGIC.len();
     let mut places = Vec::new();
@@ -60,7 +60,7 @@ fn chunk_places(bytes: &[u8]) -> Vec<usize> {
 }
 
 #[test]
-fn what_stands_behind_a_damaged_chunk_is_read() {
+fn chunks_after_a_damaged_one_are_read() {
     let folder = tempfile::tempdir().unwrap();
     let sound = recorded(4, 100, RecordingOptions::default());
     let chunks = chunk_places(&sound);
@@ -92,25 +92,25 @@ fn channels_that_a_damaged_chunk_describes_are_known_from_the_summary() {
     bytes[first + 100] ^= 1;
     let recording = Recording::open(&write(folder.path(), &bytes)).unwrap();
     assert_eq!((recording.entries().len(), recording.damage().len()), (2 * 5, 1));
-    // Without a summary nobody knows what they are called, which is said.
+    // Without a summary their names are unknown, which is reported.
     let cut = &bytes[..bytes.len() - 8];
     let error = Recording::open(&write(folder.path(), cut)).unwrap_err().to_string();
     assert!(error.contains("none of its messages can be read") && !error.contains("no channel"), "{error}");
 }
 
 #[test]
-fn a_message_without_a_chunk_that_is_damaged_is_left_out_alone() {
+fn only_the_damaged_message_outside_of_chunks_is_left_out() {
     let folder = tempfile::tempdir().unwrap();
     let own = Recording::open(&write(folder.path(), &recorded(3, 10, RecordingOptions::default()))).unwrap();
     let sound = rewritten(&own, unchunked());
     let payloads: Vec<usize> = (0..sound.len() - 4).filter(|at| sound[*at..].starts_with(b"V2VL")).collect();
     assert_eq!(payloads.len(), 15);
-    // The length of its record, which stands before 22 bytes of times and numbers.
+    // The length of its record, which precedes 22 bytes of times and numbers.
     let mut bytes = sound.clone();
     bytes[payloads[4] - 22 - 7] ^= 2;
     let recording = Recording::open(&write(folder.path(), &bytes)).unwrap();
     assert_eq!((recording.entries().len(), recording.damage().len()), (14, 1), "{:?}", recording.damage());
-    // A bit of what nobody else checks: when it arrived.
+    // A bit without any other checksum: the time of arrival.
     let mut bytes = sound;
     bytes[payloads[4] - 10] ^= 2;
     let recording = Recording::open(&write(folder.path(), &bytes)).unwrap();
@@ -124,7 +124,7 @@ fn a_chunk_that_asks_for_a_huge_window_is_refused() {
     let options = RecordingOptions { zstd_level: Some(1), with_ros: false };
     let mut bytes = recorded(3, 100, options);
     let frame = bytes.windows(4).position(|bytes| bytes == [0x28, 0xb5, 0x2f, 0xfd]).unwrap();
-    // The window descriptor of the frame: 2 GiB. zstd itself allows a stream 128 MiB, and looks before it allocates.
+    // The window descriptor of the frame: 2 GiB. zstd itself allows a stream 128 MiB, and checks before it allocates.
     assert_eq!(bytes[frame + 4] & 0x20, 0, "a frame with a window");
     bytes[frame + 5] = 21 << 3;
     let recording = Recording::open(&write(folder.path(), &bytes)).unwrap();
@@ -138,14 +138,15 @@ fn a_record_that_reaches_beyond_its_chunk_is_refused() {
     let folder = tempfile::tempdir().unwrap();
     let mut bytes = recorded(1, 100, RecordingOptions { zstd_level: None, with_ros: false });
     let number = |bytes: &[u8], at: usize| u64::from_le_bytes(bytes[at..at + 8].try_into().unwrap());
-    // Behind two times come the length unpacked, the checksum (0: none), no name of a packing, the length.
+    // Two times are followed by the unpacked length, the checksum (0: none), an empty name of the compression, the
+    // length.
     let chunk = chunk_places(&bytes)[0] + 9;
     bytes[chunk + 24..chunk + 28].fill(0);
     assert_eq!(bytes[chunk + 28..chunk + 32], [0; 4]);
     let shorter = number(&bytes, chunk + 32) - 4;
     bytes[chunk + 32..chunk + 40].copy_from_slice(&shorter.to_le_bytes());
     let error = Recording::open(&write(folder.path(), &bytes)).unwrap_err();
-    assert!(error.to_string().contains("not as long as what is in it"), "{error}");
+    assert!(error.to_string().contains("differs in length from its contents"), "{error}");
 }
 
 proptest! {
@@ -197,7 +198,7 @@ proptest! {
     }
 
     #[test]
-    fn what_is_damaged_anyhow_never_panics(places in vec((0.0_f64..1.0, any::<u8>()), 1..40), without_chunks: bool) {
+    fn random_damage_never_panics(places in vec((0.0_f64..1.0, any::<u8>()), 1..40), without_chunks: bool) {
         let mut bytes = recorded(3, 10, RecordingOptions::default());
         let folder = tempfile::tempdir().unwrap();
         if without_chunks {

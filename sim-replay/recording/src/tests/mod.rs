@@ -1,4 +1,4 @@
-//! Recordings written, read back, cut and filled up.
+//! Recordings written, read back, truncated and on a full disk.
 
 mod damaged;
 mod public_reader;
@@ -67,7 +67,7 @@ fn tick_messages(tick: u64, points: usize) -> Vec<(Key, Vec<u8>)> {
     messages
 }
 
-/// Memory that is full at some point.
+/// Memory that is full after a number of bytes.
 #[derive(Clone)]
 struct Disk {
     bytes: Arc<Mutex<Vec<u8>>>,
@@ -144,7 +144,7 @@ fn write(folder: &Path, bytes: &[u8]) -> PathBuf {
 }
 
 #[test]
-fn what_is_read_is_what_was_written() {
+fn messages_read_equal_those_written() {
     for zstd_level in [None, Some(1)] {
         let folder = tempfile::tempdir().unwrap();
         let options = RecordingOptions { zstd_level, with_ros: true };
@@ -165,7 +165,7 @@ fn what_is_read_is_what_was_written() {
 }
 
 #[test]
-fn sweeps_in_coordinates_of_a_map_are_told_to_ros_tools_too() {
+fn sweeps_in_map_coordinates_are_converted_for_ros_tools_too() {
     let disk = Disk::new(usize::MAX);
     let mut writer = RecordingWriter::over(disk.clone(), Path::new("t"), RecordingOptions::default()).unwrap();
     // UTM: east, north, height.
@@ -179,17 +179,17 @@ fn sweeps_in_coordinates_of_a_map_are_told_to_ros_tools_too() {
     let folder = tempfile::tempdir().unwrap();
     let recording = Recording::open(&write(folder.path(), &disk.bytes())).unwrap();
     let messages = messages_of(&recording);
-    let told: Vec<_> = messages.iter().filter(|(topic, ..)| topic == "/4279/points").collect();
-    assert_eq!((messages.len(), told.len()), (3, 1), "what is no number is recorded as it came");
+    let converted: Vec<_> = messages.iter().filter(|(topic, ..)| topic == "/4279/points").collect();
+    assert_eq!((messages.len(), converted.len()), (3, 1), "a NaN is recorded unchanged");
     let north = 5_428_000.0_f32.to_le_bytes();
-    assert!(told[0].2.windows(4).any(|bytes| bytes == north));
+    assert!(converted[0].2.windows(4).any(|bytes| bytes == north));
 }
 
 #[test]
 fn a_recording_is_a_scene() {
     let folder = tempfile::tempdir().unwrap();
     write(folder.path(), &recorded(3, 50, RecordingOptions::default()));
-    // The run folder names it as well as the file does.
+    // The run folder is accepted as well as the file.
     let scenario = dataset::open(folder.path()).unwrap().scenarios.remove(0);
     assert_eq!(scenario.agents, AGENTS.map(|cav| CavId::new(cav).unwrap()));
     let captures: Vec<u64> = scenario.ticks.iter().map(|tick| tick.capture_nanos).collect();
@@ -208,7 +208,7 @@ fn a_truth_that_cannot_be_read_is_a_problem_and_no_end() {
     for tick in 0..2 {
         for (key, mut payload) in tick_messages(tick, 10) {
             if tick == 1 && key.topic == protocol::Topic::Truth {
-                // Behind the header, which stays sound.
+                // After the header, which stays valid.
                 payload.truncate(payload.len() - 1);
             }
             writer.write(&key, tick, &payload).unwrap();
@@ -276,7 +276,7 @@ fn a_first_message_that_is_none_spoils_none_after_it() {
 }
 
 #[test]
-fn the_first_of_two_replays_of_one_moment_is_taken_with_its_own_truth() {
+fn the_first_of_two_replays_of_one_tick_is_used_with_its_own_truth() {
     let disk = Disk::new(usize::MAX);
     let mut writer = RecordingWriter::over(disk.clone(), Path::new("t"), RecordingOptions::default()).unwrap();
     for (key, payload) in tick_messages(0, 1) {
@@ -284,7 +284,7 @@ fn the_first_of_two_replays_of_one_moment_is_taken_with_its_own_truth() {
         if key.topic == protocol::Topic::Truth {
             let second = Stamp { epoch: 2, ..stamp("replay", 0) };
             let nothing = Truth { tick: 0, agents: Vec::new() };
-            // The same once more is no news.
+            // The same again is a duplicate.
             for stamp in [stamp("replay", 0), second] {
                 writer.write(&key, 6, &wire::encode(&stamp, nothing.clone()).unwrap().to_vec()).unwrap();
             }
@@ -294,13 +294,13 @@ fn the_first_of_two_replays_of_one_moment_is_taken_with_its_own_truth() {
     let folder = tempfile::tempdir().unwrap();
     let mut dataset = dataset::open(&write(folder.path(), &disk.bytes())).unwrap();
     assert_eq!(dataset.problems.len(), 1, "{:?}", dataset.problems);
-    assert!(dataset.problems[0].to_string().contains("1 moments"), "{}", dataset.problems[0]);
+    assert!(dataset.problems[0].to_string().contains("1 ticks"), "{}", dataset.problems[0]);
     let frame = dataset.scenarios.remove(0).load(0, 0, &LoadOptions::default()).unwrap();
     assert_eq!(frame.objects.len(), 1);
 }
 
 #[test]
-fn a_full_disk_leaves_what_is_whole() {
+fn a_full_disk_leaves_whole_chunks() {
     let folder = tempfile::tempdir().unwrap();
     let one = recorded(1, 2_000, RecordingOptions::default()).len();
     let disk = Disk::new(5 * one / 2);
@@ -312,10 +312,10 @@ fn a_full_disk_leaves_what_is_whole() {
         }
         failures.extend(writer.flush().err());
     }
-    let said: Vec<String> = failures.iter().map(ToString::to_string).collect();
-    assert!(matches!(failures[0], RecordingError::Io { .. }), "{said:?}");
-    assert!(said[0].contains("full.mcap") && said[0].contains("storage"), "{said:?}");
-    assert!(failures[1..].iter().all(|error| matches!(error, RecordingError::Ended { .. })), "{said:?}");
+    let messages: Vec<String> = failures.iter().map(ToString::to_string).collect();
+    assert!(matches!(failures[0], RecordingError::Io { .. }), "{messages:?}");
+    assert!(messages[0].contains("full.mcap") && messages[0].contains("storage"), "{messages:?}");
+    assert!(failures[1..].iter().all(|error| matches!(error, RecordingError::Ended { .. })), "{messages:?}");
     assert!(writer.finish().is_err());
     assert_eq!(writer.whole_messages(), 2 * 5, "two ticks were whole");
     drop(writer);
@@ -326,7 +326,7 @@ fn a_full_disk_leaves_what_is_whole() {
 }
 
 #[test]
-fn what_is_no_recording_is_refused_with_a_reason() {
+fn a_file_that_is_no_recording_is_refused_with_a_reason() {
     let folder = tempfile::tempdir().unwrap();
     for bytes in
         [b"".as_slice(), b"\x89MCAP", b"hello, hello, hello", &recorded(1, 1, RecordingOptions::default())[..8]]
@@ -334,7 +334,7 @@ fn what_is_no_recording_is_refused_with_a_reason() {
         let error = Recording::open(&write(folder.path(), bytes)).unwrap_err();
         assert!(matches!(error, RecordingError::NotOurs { .. }), "{error}");
     }
-    // A file of someone else: whole, but without a channel of ours.
+    // A complete file of another program, without a channel of this one.
     let disk = Disk::new(usize::MAX);
     RecordingWriter::over(disk.clone(), Path::new("t"), RecordingOptions::default()).unwrap().finish().unwrap();
     let error = Recording::open(&write(folder.path(), &disk.bytes())).unwrap_err();

@@ -1,10 +1,10 @@
-//! What others make of our recordings.
+//! Recordings read by the public MCAP reader and a ROS 2 decoder.
 
 use std::path::Path;
 
 use super::{RecordingOptions, pose, recorded, write};
 
-/// The public reader and a decoder of ROS 2 messages, where Python has them.
+/// The public reader and a decoder of ROS 2 messages, if Python has them.
 fn public_reader(path: &Path) -> Option<serde_json::Value> {
     let script = concat!(env!("CARGO_MANIFEST_DIR"), "/../../deploy/tools/check_recording.py");
     let python = std::env::var("V2V_PYTHON").unwrap_or_else(|_| "python3".into());
@@ -15,12 +15,12 @@ fn public_reader(path: &Path) -> Option<serde_json::Value> {
             return None;
         }
     };
-    let said = String::from_utf8_lossy(&output.stderr);
+    let stderr = String::from_utf8_lossy(&output.stderr);
     if output.status.code() == Some(2) {
-        eprintln!("skipped: {}", said.trim());
+        eprintln!("skipped: {}", stderr.trim());
         return None;
     }
-    assert!(output.status.success(), "{said}");
+    assert!(output.status.success(), "{stderr}");
     Some(serde_json::from_slice(&output.stdout).unwrap())
 }
 
@@ -38,7 +38,7 @@ fn the_public_reader_and_a_ros_decoder_find_the_same_numbers() {
         let folder = tempfile::tempdir().unwrap();
         let path = write(folder.path(), &recorded(3, 100, RecordingOptions { zstd_level, with_ros: true }));
         let Some(found) = public_reader(&path) else { return };
-        // Of each tick: two sweeps, two recorded poses, a truth; for ROS two clouds, boxes and transforms.
+        // Of each tick: two sweeps, two recorded poses, a ground truth; for ROS two clouds, boxes and transforms.
         assert_eq!(found["indexed"], serde_json::json!({"chunks": 3, "messages": 27}));
         assert_eq!(found["messages"]["v2v/test/4279/lidar"], 3);
         let points = &found["last"]["/4288/points"];

@@ -1,4 +1,4 @@
-//! Generated scenes that are kept and used again: whole or not at all, and only where they are what is asked for.
+//! Scene cache: reuses generated scenes if they are complete and match the options.
 
 use std::path::Path;
 use std::{fs, io};
@@ -13,10 +13,10 @@ use super::scenes::{Summary, generate, sources};
 use crate::map::TownSource;
 use support::bounded_file;
 
-/// A longer file does not come from here, bytes.
+/// Longer files were not written by this program, bytes.
 const MAX_FILE_BYTES: u64 = 1 << 20;
 
-/// What [`FILE_NAME`] says of how a scenario was made.
+/// Settings recorded in [`FILE_NAME`].
 #[derive(Debug, Deserialize)]
 struct MadeWith {
     generator: Generator,
@@ -40,11 +40,11 @@ fn default_layout() -> String {
     SceneLayout::Opv2v.name().to_owned()
 }
 
-/// Whether scenes of these options lie in their folder already.
+/// True if scenes of these options are in their folder already.
 ///
 /// # Errors
-/// [`SynthError::Kept`] where something else lies there, with the first setting in which it differs;
-/// [`SynthError::Read`] where that cannot be told.
+/// [`SynthError::Kept`] if the folder holds other scenes, with the first setting in which they differ;
+/// [`SynthError::Read`] if their settings cannot be read.
 pub fn are_kept(options: &SynthOptions) -> Result<bool, SynthError> {
     let folder = options.out.as_path();
     if !folder.exists() {
@@ -84,8 +84,8 @@ pub fn are_kept(options: &SynthOptions) -> Result<bool, SynthError> {
     Ok(true)
 }
 
-/// [`generate`], but the folder has its name only when all is in it: a run that is cut off leaves no half of a data set to
-/// the next one, which begins anew.
+/// As [`generate`], but the folder is renamed to its final name when the data set is complete: an interrupted run
+/// leaves no partial data set, and the next run starts again.
 ///
 /// # Errors
 /// As [`generate`].
@@ -101,7 +101,7 @@ pub fn generate_whole(options: &SynthOptions, progress: &(dyn Fn(u64) + Sync)) -
     Ok(summary)
 }
 
-/// How the scenarios in a folder were made. Without a file that says so they were not made here.
+/// Settings with which the scenarios in a folder were made; an error if a scenario has no file with its settings.
 fn read(folder: &Path) -> Result<Vec<Generator>, SynthError> {
     let at = |path: &Path, problem: String| SynthError::Read { path: path.to_owned(), problem };
     let entries = fs::read_dir(folder).map_err(|error| at(folder, error.to_string()))?;
@@ -127,13 +127,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn kept_scenes_are_taken_only_for_what_they_are() {
+    fn cached_scenes_are_used_only_for_their_own_options() {
         let folder = tempfile::tempdir().unwrap();
         let out = folder.path().join("scenes");
         let options =
             SynthOptions { scenes: 2, frames: 2, agents: 2..=2, ..SynthOptions::new(Subset::V2vdet, 7, out.clone()) };
         assert!(!are_kept(&options).unwrap());
-        // Of a run with another seed that was cut off.
+        // Left by an interrupted run with another seed.
         fs::create_dir_all(folder.path().join("scenes.unfinished/v2vdet_town1_s8_0000")).unwrap();
         generate_whole(&options, &|_| {}).unwrap();
         assert!(are_kept(&options).unwrap());

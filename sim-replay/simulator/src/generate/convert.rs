@@ -1,4 +1,4 @@
-//! Conversion: a data set that was opened, written in another layout.
+//! Conversion: writes an opened data set in another layout.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -16,39 +16,39 @@ use super::layout::{
 use super::scenes::check_folder;
 use dataset::{Dataset, LeftOut, LoadOptions, LoadedTick, Problem, ReadError, Scenario};
 
-/// Lengths of a tick that are tried, nanoseconds: a simulator's step, and what clocks of sensors are read to.
+/// Candidate lengths of a tick, nanoseconds: the step of a simulator, and resolutions of sensor clocks.
 const TICKS_NANOS: [u64; 4] = [50_000_000, 10_000_000, 1_000_000, 1_000];
 
-/// What to write, and where.
+/// Output folder and layout of a conversion.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ConvertOptions {
-    /// Where the scenarios go.
+    /// Folder of the scenarios.
     pub out: PathBuf,
     /// Layout of the files.
     pub layout: SceneLayout,
-    /// Whether to write into a folder that holds something already.
+    /// True to write into a folder that is not empty.
     pub force: bool,
 }
 
-/// What was converted.
+/// Summary of a conversion.
 #[derive(Debug, Default)]
 pub struct Converted {
     /// Scenarios.
     pub scenarios: usize,
     /// Frames of all agents together.
     pub agent_frames: usize,
-    /// What the layout has no place for, and how often it was left out.
+    /// Data that the layout cannot hold, with the number of times that it was left out.
     pub omitted: BTreeMap<&'static str, u64>,
-    /// What could not be read.
+    /// Frames and files that could not be read.
     pub left_out: LeftOut,
 }
 
-/// Writes all scenarios of a data set in a layout. `progress` is called with the number of moments
-/// that are done and their total, from any thread.
+/// Writes all scenarios of a data set in a layout. `progress` is called with the number of completed capture times and
+/// their total, from any thread.
 ///
 /// # Errors
-/// [`SynthError`] where the layout cannot hold a scene or a file cannot be written. A frame that cannot be read is left out
-/// and stands in [`Converted::left_out`].
+/// [`SynthError`] if the layout cannot hold a scene or a file cannot be written. A frame that cannot be read is left
+/// out and listed in [`Converted::left_out`].
 pub fn convert(
     dataset: &Dataset,
     options: &ConvertOptions,
@@ -98,7 +98,7 @@ fn header(scenario: &Scenario, dataset: &Dataset) -> Result<SceneHeader, SynthEr
     })
 }
 
-/// Writes the moments at which the ego's frame can be read; returns how many frames.
+/// Writes the capture times at which the ego's frame can be read; returns the number of frames.
 fn write_moments(
     scenario: &Scenario,
     writer: &dyn SceneWriter,
@@ -123,7 +123,7 @@ fn write_moments(
     moments.sum()
 }
 
-/// The frames of a moment. No layout has a place for sweeps of which nobody knows where they were taken.
+/// The frames of a capture time. No layout can hold sweeps without a pose.
 fn read(scenario: &Scenario, index: usize) -> LoadedTick {
     let options = LoadOptions { lidar_variant: None, points: true, radar: true };
     let mut loaded = scenario.load_tick(index, 0..scenario.agents.len(), &options);
@@ -139,7 +139,7 @@ fn read(scenario: &Scenario, index: usize) -> LoadedTick {
 fn variants(scenario: &Scenario, agent: usize, index: usize, left_out: &Mutex<LeftOut>) -> Vec<SweepVariant> {
     let read = |name: &String| {
         let cloud = scenario.load_points(agent, index, Some(name)).map_err(|error| {
-            // A copy is a part of its frame, not a frame.
+            // Counted as a file, since a copy is part of its frame.
             locked(left_out).add_files([&error]);
         });
         let cloud = cloud.ok()?;

@@ -1,4 +1,4 @@
-//! `data_protocol.yaml`: how a scenario was made.
+//! `data_protocol.yaml`: settings with which a scenario was made.
 
 use super::layout::SceneLayout;
 use super::options::SynthOptions;
@@ -6,10 +6,10 @@ use super::recording::SceneSpec;
 use super::traffic::STEP_S;
 use crate::map::{Finding, Town};
 
-/// The file's name, in the folder of its scenario.
+/// Name of the file, in the folder of its scenario.
 pub(super) const FILE_NAME: &str = "data_protocol.yaml";
 
-/// The text of the file for a scene that was converted: from which layout, and what it was called there.
+/// The text of the file for a converted scene: source layout and name of the scenario there.
 pub(crate) fn converted_yaml(from: &str, scenario: &str, tick_nanos: u64) -> String {
     let (version, tick_s) = (env!("CARGO_PKG_VERSION"), tick_nanos as f64 / 1e9);
     let scenario = scenario.replace('\'', "''");
@@ -27,12 +27,13 @@ world:
     )
 }
 
-/// The text of the file. It names what decides the bytes of the scenario, and the sensors in the words of OpenCDA.
+/// The text of the file. It holds every setting that determines the bytes of the scenario, and the sensors in the terms
+/// of OpenCDA.
 pub(crate) fn protocol_yaml(options: &SynthOptions, spec: &SceneSpec, town: &Town) -> String {
     let SynthOptions { subset, seed, town_seed, weather, frames, period_s, .. } = options;
     let (name, town_name, scene_seed, agents) = (&spec.name, &town.name, spec.seed, spec.agents);
     let (subset, weather, version) = (subset.name(), weather.name(), env!("CARGO_PKG_VERSION"));
-    // Without a word of it the layout is OPV2V's.
+    // Without the entry the layout is OPV2V's.
     let layout = match options.layout {
         SceneLayout::Opv2v => String::new(),
         layout => format!("  layout: {}\n", layout.name()),
@@ -88,12 +89,12 @@ world:
     )
 }
 
-/// What was not built as the map gives it; nothing where all of it was.
+/// Findings of the map: parts that were not built as the file gives them; empty if there are none.
 fn map_yaml(findings: &[Finding]) -> String {
     if findings.is_empty() {
         return String::new();
     }
-    // Any JSON is YAML too, and has no strings that need care.
+    // JSON is valid YAML, and its strings need no further escaping.
     let lines = findings.iter().filter_map(|finding| serde_json::to_string(finding).ok());
     lines.fold("map_findings:\n".to_owned(), |yaml, line| yaml + "  - " + &line + "\n")
 }

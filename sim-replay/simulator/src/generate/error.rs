@@ -1,44 +1,44 @@
-//! What can go wrong when scenes are generated.
+//! Errors of scene generation.
 
 use std::path::PathBuf;
 
 use crate::map::TownError;
 
-/// Why scenes could not be generated.
+/// Reasons why scenes could not be generated.
 #[derive(Debug, thiserror::Error)]
 pub enum SynthError {
-    /// The town could not be built.
+    /// The map could not be built.
     #[error(transparent)]
     Town(#[from] TownError),
-    /// There is something in the output folder already.
-    #[error("{} is not empty; --force writes into it all the same", .0.display())]
+    /// The output folder is not empty.
+    #[error("{} is not empty; --force writes into it anyway", .0.display())]
     NotEmpty(PathBuf),
-    /// Scenes that are kept are not those that are asked for.
+    /// Cached scenes do not match the options.
     #[error("{} holds scenes made with {setting} {found}, not {wanted}; take another folder, or remove it", folder.display())]
     Kept {
-        /// Where they lie.
+        /// Folder of the cached scenes.
         folder: PathBuf,
         /// The first setting that differs.
         setting: &'static str,
-        /// What they were made with.
+        /// Value with which they were made.
         found: String,
-        /// What is asked for.
+        /// Requested value.
         wanted: String,
     },
-    /// What lies in a folder does not say how it was made.
-    #[error("{}: {problem}; scenes that were generated say there how", path.display())]
+    /// The settings of the scenes in a folder cannot be read.
+    #[error("{}: {problem}; generated scenes record their settings in this file", path.display())]
     Read {
-        /// The file that should.
+        /// The file with the settings.
         path: PathBuf,
-        /// What is wrong with it.
+        /// The fault.
         problem: String,
     },
     /// A file or folder could not be written.
     #[error("{}: {source}", path.display())]
     Write {
-        /// What was written.
+        /// File or folder that was to be written.
         path: PathBuf,
-        /// What the system says.
+        /// Error of the operating system.
         source: std::io::Error,
     },
     /// A layout cannot hold a scene.
@@ -46,34 +46,34 @@ pub enum SynthError {
     Layout {
         /// The layout's name.
         layout: &'static str,
-        /// What it cannot hold.
+        /// Property of the scene that the layout cannot hold.
         reason: String,
     },
-    /// A number of the options makes no sense.
+    /// A numeric option is invalid.
     #[error("{option} is {value}; {expected}")]
     Option {
         /// Its name on the command line.
         option: &'static str,
-        /// What was given.
+        /// Given value.
         value: String,
-        /// What would do.
+        /// Valid values.
         expected: &'static str,
     },
     /// The road network has no place for a vehicle.
-    #[error("town {0} has no lane long enough to start from")]
+    #[error("map {0} has no lane long enough to start from")]
     NoRoad(String),
-    /// No group of vehicles stays together.
+    /// Too few vehicles stay near the ego.
     #[error(
         "scene {scenario}: {found} vehicles stay within {range_m} m of the ego, {wanted} are wanted; fewer --agents or --frames help"
     )]
     Alone {
         /// The scenario.
         scenario: String,
-        /// How many companions there are.
+        /// Number of companions found.
         found: usize,
-        /// How many are needed.
+        /// Number of companions needed.
         wanted: usize,
-        /// Within this distance, metres.
+        /// Distance from the ego within which they have to stay, metres.
         range_m: f64,
     },
 }

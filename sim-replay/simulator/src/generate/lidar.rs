@@ -6,7 +6,7 @@ use super::raycast::{Body, Caster, GROUND, MISS, RayPattern, Surface, Sweep};
 use super::weather::{Echo, Weather};
 use support::random::SplitMix64;
 
-/// Where the LiDAR sits on its vehicle: x forward, y left, z up from the ground under the middle, metres.
+/// Position of the LiDAR on its vehicle: x forward, y left, z up from the ground under the centre, metres.
 pub const LIDAR_MOUNT_M: [f64; 3] = [-0.5, 0.0, 1.95];
 
 /// Channels of the LiDAR.
@@ -19,15 +19,15 @@ const ELEVATIONS_DEG: [f32; 2] = [-25.0, 2.0];
 const RANGE_M: f32 = 120.0;
 /// Deviation of the range noise, metres.
 const NOISE_M: f64 = 0.02;
-/// Share of rays that is lost whatever they meet.
+/// Share of rays that is lost regardless of the target.
 const DROP_ALWAYS: f64 = 0.1;
 /// Weaker returns than this may be lost as well.
 const DROP_BELOW_INTENSITY: f32 = 0.7;
-/// Share that is lost at intensity 0; falls to none at [`DROP_BELOW_INTENSITY`].
+/// Share that is lost at intensity 0; falls linearly to 0 at [`DROP_BELOW_INTENSITY`].
 const DROP_AT_ZERO: f32 = 0.15;
-/// Loss of light in clear air, per metre: CARLA's attenuation, and all that its intensity tells.
+/// Loss of light in clear air, per metre: CARLA's attenuation, the only term of its intensity.
 const ATTENUATION_PER_M: f32 = 0.004;
-/// Share of light that the ground throws back.
+/// Reflectance of the ground.
 const GROUND_REFLECTIVITY: f32 = 0.25;
 
 /// The rays of one turn. The sensor turns clockwise seen from above and passes the rear when a sweep begins and ends.
@@ -61,9 +61,9 @@ pub struct Lidar {
 pub struct LidarSweep<'a> {
     /// x, y, z in metres and intensity, in the (right-handed) frame of the sensor at the end of the sweep.
     pub points: &'a [[f32; 4]],
-    /// How many of the points lie on each body.
+    /// Number of points on each body.
     pub hits: &'a [u32],
-    /// For each point 0 where it lies on a surface, as in clear air, and 1 where it is clutter: fog or a flake.
+    /// For each point 0 if it lies on a surface, as in clear air, and 1 if it is clutter: fog or a flake.
     pub labels: &'a [u8],
 }
 
@@ -89,7 +89,7 @@ impl Lidar {
         self.again(sensor, bodies, weather, seed)
     }
 
-    /// The last sweep once more, in another weather or with other noise: `sensor` and `bodies` are those of
+    /// The last sweep again, in another weather or with other noise: `sensor` and `bodies` are those of
     /// [`Self::sweep`].
     pub fn again(&mut self, sensor: &Sweep, bodies: &[Body<'_>], weather: Weather, seed: u64) -> LidarSweep<'_> {
         self.points.clear();
@@ -119,7 +119,7 @@ impl Lidar {
     }
 }
 
-/// What one ray reports: range with noise, intensity, and what was hit; nothing where the return is lost.
+/// Result of one ray: range with noise, intensity, and the index of the body; `None` if the return is lost.
 #[inline]
 fn measure(
     depth_m: f32,
@@ -137,12 +137,12 @@ fn measure(
             };
             match weather.echo((hit != MISS).then_some(depth_m), reflectivity, random) {
                 Echo::Target(kept) => (depth_m, kept * (-ATTENUATION_PER_M * depth_m).exp(), hit),
-                Echo::LinkEmulator(range_m, intensity) => (range_m, intensity, MISS),
+                Echo::Backscatter(range_m, intensity) => (range_m, intensity, MISS),
                 Echo::Lost => return None,
             }
         }
     };
-    // One draw decides both losses: they are independent, so their shares of what is left multiply.
+    // One draw decides both losses: they are independent, so their survival shares multiply.
     let faint = (1.0 - intensity / DROP_BELOW_INTENSITY).max(0.0) * DROP_AT_ZERO;
     let kept = (1.0 - DROP_ALWAYS) * (1.0 - f64::from(faint));
     if random.unit() >= kept {
@@ -206,7 +206,7 @@ mod tests {
         let errors: Vec<f64> = ahead.iter().zip(&ranges).map(|(p, cos)| (f64::from(p[0]) - 20.0) / cos).collect();
         let deviation = (errors.iter().map(|e| e * e).sum::<f64>() / errors.len() as f64).sqrt();
         assert!((deviation - NOISE_M).abs() < 0.002, "{deviation}");
-        // Nearly everything in this fan is nearer than 89 m, where only the general loss is left.
+        // Nearly all returns in this fan are nearer than 89 m, where only the general loss applies.
         let fan = 64 * (2.0 * (8.0f64 / 20.0).atan() / f64::from(TAU) * COLUMNS as f64) as usize;
         let kept = ahead.len() as f64 / fan as f64;
         assert!((kept - 0.9).abs() < 0.02, "{kept}");

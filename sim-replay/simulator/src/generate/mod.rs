@@ -1,10 +1,9 @@
-//! Scene generation: traffic in a town, and the sensors of the vehicles in it.
+//! Scene generation: traffic on a map, and the sensors of its vehicles.
 //!
-//! [`generate`] writes scenes in a [`SceneLayout`], by default OPV2V's, and the readers of this crate read them back like
-//! any other dataset. [`convert`] writes a dataset that was opened in such a layout.
-//! The parts, in the order in which they work: a [`crate::map`] that stands still, parked vehicles, traffic that is
-//! recorded step by step, then for each agent and frame the [`lidar`], the [`radar`] and the receivers, all of them over
-//! one ray [`cast`]er, and the writer of the layout.
+//! [`generate`] writes scenes in a [`SceneLayout`], by default OPV2V's, and the readers of `dataset` read them like any
+//! other data set. [`convert`] writes an opened data set in such a layout. The stages, in order: a static
+//! [`crate::map`], parked vehicles, traffic that is recorded step by step, then for each agent and frame the [`lidar`],
+//! the [`radar`] and the receivers, all of them over one ray caster ([`raycast`]), and the writer of the layout.
 //!
 //! ```no_run
 //! use simulator::generate::{Subset, SynthOptions, generate};

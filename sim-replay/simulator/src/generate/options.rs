@@ -1,4 +1,4 @@
-//! What to generate.
+//! Options of scene generation.
 
 use std::ops::RangeInclusive;
 use std::path::PathBuf;
@@ -34,29 +34,29 @@ impl Subset {
     }
 }
 
-/// What to generate. The same options give the same files, byte for byte.
+/// Options of scene generation. The same options give the same files, byte for byte.
 ///
 /// By convention seeds 0 to 999 are for training and validation, and 1000 and above for measuring only, so that no
-/// measured scene was ever trained on. The town seed is the same for all: it is the place one drives in.
+/// measured scene was ever trained on. The town seed is the same for all: it determines the map.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SynthOptions {
-    /// Which kind of scenes.
+    /// Subset: number of agents and default maps.
     pub subset: Subset,
     /// Fixes routes, lanes, speeds, traffic, parked vehicles and noise.
     pub seed: u64,
-    /// Where the scenarios go.
+    /// Folder of the scenarios.
     pub out: PathBuf,
     /// Layout of the files.
     pub layout: SceneLayout,
-    /// The town; each subset has its own otherwise, V2VDet both in turn.
+    /// The map; by default that of the subset, for V2VDet both in turn.
     pub town: Option<TownSource>,
-    /// Fixes everything that stands still for good.
+    /// Determines all static objects.
     pub town_seed: u64,
     /// Traversals of a localization subset: one scenario each.
     pub traversals: usize,
     /// Scenes of V2VDet: one scenario each.
     pub scenes: usize,
-    /// How many agents a V2VDet scene may have.
+    /// Number of agents of a V2VDet scene.
     pub agents: RangeInclusive<usize>,
     /// The weather.
     pub weather: Weather,
@@ -66,7 +66,7 @@ pub struct SynthOptions {
     pub frames: usize,
     /// Simulated time from one stored frame to the next, seconds; a multiple of 0.05.
     pub period_s: f64,
-    /// Whether to write into a folder that holds something already; scenarios of the same name are replaced.
+    /// True to write into a folder that is not empty; scenarios of the same name are replaced.
     pub force: bool,
     /// Threads that cast and write; does not change the files.
     pub threads: usize,
@@ -95,7 +95,7 @@ impl SynthOptions {
         }
     }
 
-    /// Frames of a scenario when nothing else is asked for.
+    /// Default number of frames of a scenario.
     #[must_use]
     pub fn default_frames(subset: Subset) -> usize {
         if subset == Subset::V2vdet { 60 } else { 2000 }
@@ -116,7 +116,7 @@ impl SynthOptions {
     /// Checks the numbers.
     ///
     /// # Errors
-    /// [`SynthError::Option`] names the first that makes no sense.
+    /// [`SynthError::Option`] with the first invalid option.
     pub fn validate(&self) -> Result<(), SynthError> {
         let check = |is_good: bool, option: &'static str, value: String, expected: &'static str| {
             if is_good { Ok(()) } else { Err(SynthError::Option { option, value, expected }) }

@@ -1,4 +1,4 @@
-//! Parked vehicles: which spots are taken, and by what.
+//! Parked vehicles: occupancy and vehicle of each spot.
 
 use super::raycast::{Placement, wrapped};
 use super::traffic::Rectangle;
@@ -19,13 +19,13 @@ pub(crate) struct ParkedVehicle {
     pub(crate) placement: Placement,
 }
 
-/// Parks vehicles on the spots of a town; how full the town is differs from seed to seed.
+/// Parks vehicles on the spots of a map; the occupancy differs from seed to seed.
 pub(crate) fn park(town: &Town, lanes: &LaneIndex, seed: u64) -> Vec<ParkedVehicle> {
     let mut random = SplitMix64::new(seed);
     let occupancy = random.between(0.3, 0.7);
     let mut parked: Vec<ParkedVehicle> = Vec::new();
     for (number, spot) in town.parking.iter().enumerate() {
-        // A stream of its own for each spot: a spot that is added does not reshuffle all that follow.
+        // Each spot has its own random stream: an added spot does not change the others.
         let mut random = SplitMix64::derived(seed, &[number as u64]);
         if !random.chance(occupancy) {
             continue;

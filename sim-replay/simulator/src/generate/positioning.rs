@@ -11,10 +11,10 @@ const ALTITUDE_M: f64 = 0.001;
 const HEADING_DEG: f64 = 0.1;
 /// Deviation of the measured speed, metres per second.
 const SPEED_MPS: f64 = 0.2;
-/// Metres of one degree of latitude on the sphere that CARLA takes the Earth for.
+/// Metres per degree of latitude on CARLA's spherical Earth.
 const METRES_PER_DEG: f64 = 6_378_137.0 * std::f64::consts::PI / 180.0;
 
-/// What the receivers say at one capture time; right-handed.
+/// Measurements of the receivers at one capture time; right-handed.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Fix {
     /// GNSS position in the map, metres.
@@ -66,7 +66,7 @@ impl Positioning {
             Some((position, variance)) => {
                 let (sin, cos) = heading_rad.sin_cos();
                 let moved = speed_mps * elapsed_s;
-                // A bend driven as a chord, besides the noise of the speed.
+                // A bend driven as a chord, in addition to the noise of the speed.
                 let drift = (SPEED_MPS * elapsed_s).powi(2) + (0.5 * yaw_rate_radps * elapsed_s * moved).powi(2);
                 let predicted = [position[0] + moved * cos, position[1] + moved * sin];
                 let gain = (variance + drift) / (variance + drift + measured);

@@ -13,7 +13,7 @@ pub const RADAR_VELOCITY_SPAN_MPS: f64 = 64.0;
 
 /// Height of the radar above the ground, metres; it sits at the front bumper.
 const HEIGHT_M: f64 = 0.7;
-/// Share of the returns of vehicles and of standing things that is lost, and of the ground, which mirrors most away.
+/// Shares of lost returns: of vehicles and static objects, and of the ground, which reflects most away specularly.
 const LOST: f64 = 0.15;
 const LOST_GROUND: f64 = 0.96;
 /// Deviations of range (metres), direction (radians) and radial velocity (metres per second).
@@ -46,8 +46,8 @@ impl Default for Radar {
 }
 
 impl Radar {
-    /// The returns at the end of `vehicle`'s motion: x, y, z in metres and radial velocity in metres per second (growing
-    /// distance is positive), in the (right-handed) frame of a sensor at `reference_m` on the same vehicle.
+    /// The returns at the end of `vehicle`'s motion: x, y, z in metres and radial velocity in metres per second
+    /// (growing distance is positive), in the (right-handed) frame of a sensor at `reference_m` on the same vehicle.
     ///
     /// `half_length_m` is the vehicle's; `sweep_s` the time that the motions take.
     #[allow(clippy::too_many_arguments, reason = "two sensors' frames and one scene; a struct would hide none of it")]
@@ -106,7 +106,7 @@ pub fn velocity_to_red(velocity_mps: f32) -> f32 {
     (velocity_mps / (2.0 * RADAR_VELOCITY_SPAN_MPS as f32) + 0.5).clamp(0.0, 1.0)
 }
 
-/// The way back: metres per second from the red channel, 0..1.
+/// Radial velocity in metres per second from the red channel, 0..1.
 #[must_use]
 pub fn red_to_velocity(red: f32) -> f32 {
     (red - 0.5) * 2.0 * RADAR_VELOCITY_SPAN_MPS as f32

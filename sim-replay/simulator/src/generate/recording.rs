@@ -1,4 +1,4 @@
-//! One scene as it happens, before any sensor looks at it: who is where at each stored frame, and who the agents are.
+//! Scene recording before any sensor is simulated: vehicles at each stored frame, and the choice of the agents.
 
 use super::error::SynthError;
 use super::parking::{ParkedVehicle, park};
@@ -8,7 +8,7 @@ use super::vehicle::{Vehicle, VehicleKind};
 use super::world::World;
 use support::random::{SplitMix64, derive_seed};
 
-/// Agents farther than this from the ego do not hear it, metres.
+/// Communication range: agents farther than this from the ego are not received, metres.
 pub(crate) const COMM_RANGE_M: f64 = 70.0;
 /// Companions are chosen within this, so that few frames fall out of range, metres.
 const COMPANION_RANGE_M: f64 = 62.0;
@@ -16,14 +16,15 @@ const COMPANION_RANGE_M: f64 = 62.0;
 const TOGETHER: f64 = 0.9;
 /// Scenes that are tried until one has enough companions.
 const ATTEMPTS: u64 = 24;
-/// A drive during which the ego stands for longer is driven anew, seconds.
+/// A drive during which the ego stands for longer is simulated again, seconds.
 const LONGEST_STAND_S: f64 = 60.0;
-/// Traffic around the focus, metres: what a companion at the edge of the communication range can see, and a bit.
+/// Traffic around the focus, metres: the visible range of a companion at the edge of the communication range, and a
+/// margin.
 const TRAFFIC_RADIUS_M: f64 = 210.0;
-/// Tick of the first stored frame, after the habit of OpenCDA's recordings.
+/// Tick of the first stored frame, as in OpenCDA's recordings.
 const FIRST_TICK: u64 = 60;
 
-/// What to record.
+/// Parameters of a scene to record.
 #[derive(Debug, Clone)]
 pub(crate) struct SceneSpec {
     pub(crate) name: String,
@@ -37,7 +38,7 @@ pub(crate) struct SceneSpec {
 /// One scene.
 #[derive(Debug)]
 pub(crate) struct Recording {
-    /// Vehicles that move, by index.
+    /// Moving vehicles, by index.
     pub(crate) vehicles: Vec<Vehicle>,
     pub(crate) parked: Vec<ParkedVehicle>,
     pub(crate) frames: Vec<RecordedFrame>,
@@ -71,7 +72,7 @@ impl RecordedFrame {
     }
 }
 
-/// Lets a scene happen; tries others of the same seed when too few vehicles stay near the ego.
+/// Simulates a scene; tries others of the same seed if too few vehicles stay near the ego.
 pub(crate) fn record(world: &World<'_>, spec: &SceneSpec) -> Result<Recording, SynthError> {
     let parked = park(world.town, &world.lane_index, derive_seed(spec.seed, &[1]));
     let mut best: Option<(f64, Recording)> = None;
@@ -79,7 +80,7 @@ pub(crate) fn record(world: &World<'_>, spec: &SceneSpec) -> Result<Recording, S
         let (vehicles, frames) = simulate(world, spec, &parked, derive_seed(spec.seed, &[2, attempt]))?;
         let mut random = SplitMix64::derived(spec.seed, &[3, attempt]);
         let (together, agents) = choose_agents(&vehicles, &frames, spec.agents, &mut random);
-        // A drive that ends in a jam for good shows one place again and again.
+        // A drive that ends in a permanent jam shows one place again and again.
         let standing_s = longest_stand_s(&frames);
         let quality = if standing_s > LONGEST_STAND_S { together.min(0.0) - standing_s } else { together };
         if best.as_ref().is_none_or(|(least, _)| quality > *least) {
@@ -121,7 +122,7 @@ fn simulate(
     };
     let start = spawns[random.below(spawns.len())];
     let mut traffic = Traffic::new(&world.roads, &footprints, options, start, derive_seed(seed, &[1]));
-    // Until gaps and speeds are those of traffic rather than of the lottery.
+    // Until gaps and speeds are those of traffic rather than of the random initial state.
     let settling_steps = (random.between(6.0, 12.0) / STEP_S) as usize;
     (0..settling_steps).for_each(|_| traffic.step());
     let mut frames = Vec::with_capacity(spec.frames);
@@ -137,8 +138,8 @@ fn simulate(
     Ok((traffic.cars.into_iter().map(|car| car.vehicle).collect(), frames))
 }
 
-/// Chooses the ego's companions at random among those that stay near it. Also says how well they do: the smallest share
-/// of frames that one of them is in range.
+/// Chooses the ego's companions at random among those that stay near it. Also returns the smallest share of frames in
+/// which one of them is in range.
 fn choose_agents(
     vehicles: &[Vehicle],
     frames: &[RecordedFrame],
@@ -154,7 +155,7 @@ fn choose_agents(
         .filter(|(share, _)| *share > 0.0)
         .collect();
     random.shuffle(&mut together);
-    // All that stay near are as good as each other, so that following, opposite and crossing agents all occur.
+    // All that stay near are equivalent, so that following, opposite and crossing agents all occur.
     together.sort_by(|a, b| b.0.min(TOGETHER).total_cmp(&a.0.min(TOGETHER)));
     together.truncate(count - 1);
     let quality = if together.len() + 1 < count {
@@ -167,7 +168,7 @@ fn choose_agents(
     (quality, agents)
 }
 
-/// Share of the frames that a vehicle is near the ego; 0 for one that was exchanged for another on the way.
+/// Share of the frames in which a vehicle is near the ego; 0 for one that was replaced by another on the way.
 fn share_together(frames: &[RecordedFrame], vehicle: usize) -> f64 {
     let id = frames.first().and_then(|frame| frame.of(vehicle)).map(|moving| moving.id);
     let mut near = 0;
@@ -181,7 +182,7 @@ fn share_together(frames: &[RecordedFrame], vehicle: usize) -> f64 {
     near as f64 / frames.len() as f64
 }
 
-/// How long the ego stands at one place, at most, seconds.
+/// Longest time for which the ego stands still, seconds.
 fn longest_stand_s(frames: &[RecordedFrame]) -> f64 {
     let mut since: Option<(&Moving, u64)> = None;
     let mut longest = 0;

@@ -1,4 +1,4 @@
-//! From options to folders: scenes one after another, the frames of each on several threads.
+//! Scene generation from options to folders: scenes one after another, the frames of each on several threads.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -23,7 +23,7 @@ use support::random::derive_seed;
 /// Length of a step of the simulation, nanoseconds.
 const STEP_NANOS: u64 = (STEP_S * 1e9) as u64;
 
-/// What was generated.
+/// Summary of generation.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Summary {
     /// Layout of the files.
@@ -36,7 +36,7 @@ pub struct Summary {
     pub points: usize,
     /// Annotated vehicles of all agent-frames.
     pub annotations: usize,
-    /// What the layout has no place for, and how often it was left out.
+    /// Data that the layout cannot hold, with the number of times that it was left out.
     pub omitted: BTreeMap<&'static str, u64>,
     /// Parts of the map that were not built as its file gives them.
     pub findings: Vec<Finding>,
@@ -51,11 +51,10 @@ impl Summary {
     }
 }
 
-/// Generates everything that `options` ask for. `progress` hears how many scenarios of how many are done, in thousandths
-/// of one, from any thread.
+/// Generates all scenes of `options`. `progress` receives the progress in thousandths of a scenario, from any thread.
 ///
 /// # Errors
-/// [`SynthError`] where an option makes no sense, the town cannot be built or a file cannot be written.
+/// [`SynthError`] if an option is invalid, the map cannot be built or a file cannot be written.
 pub fn generate(options: &SynthOptions, progress: &(dyn Fn(u64) + Sync)) -> Result<Summary, SynthError> {
     options.validate()?;
     check_folder(&options.out, options.force)?;
@@ -82,7 +81,7 @@ pub fn generate(options: &SynthOptions, progress: &(dyn Fn(u64) + Sync)) -> Resu
     Ok(total)
 }
 
-/// The towns of the scenarios, which take them in turn.
+/// The maps of the scenarios, used in turn.
 pub(super) fn sources(options: &SynthOptions) -> Vec<TownSource> {
     match (&options.town, options.subset) {
         (Some(town), _) => vec![town.clone()],
@@ -93,7 +92,7 @@ pub(super) fn sources(options: &SynthOptions) -> Vec<TownSource> {
 }
 
 fn spec(options: &SynthOptions, town: &Town, number: usize) -> SceneSpec {
-    // Every scene has a seed of its own, whatever the number of scenes and the number of agents before it.
+    // Every scene has its own seed, independent of the numbers of scenes and agents before it.
     let seed = derive_seed(options.seed, &[options.subset as u64, number as u64]);
     let (low, high) = (*options.agents.start(), *options.agents.end());
     let is_detection = options.subset == Subset::V2vdet;
@@ -108,7 +107,7 @@ fn spec(options: &SynthOptions, town: &Town, number: usize) -> SceneSpec {
     }
 }
 
-/// Makes the folder of the output, or refuses one that holds something.
+/// Creates the output folder, or refuses one that is not empty.
 pub(super) fn check_folder(out: &std::path::Path, force: bool) -> Result<(), SynthError> {
     make_folder(out)?;
     let entries = fs::read_dir(out);
@@ -132,7 +131,7 @@ pub(super) struct Agent {
     pub(super) vehicle: usize,
     pub(super) id: i64,
     pub(super) cav: CavId,
-    /// One for each moment.
+    /// One fix for each capture time.
     pub(super) fixes: Vec<Fix>,
 }
 
@@ -180,8 +179,8 @@ impl Scene<'_, '_> {
         Ok(agents)
     }
 
-    /// Writes every moment. Each frame is made from the recording and a seed of its own, so the number of threads and their
-    /// order change nothing.
+    /// Writes every capture time. Each frame depends on the recording and its own seed only, so the number of threads
+    /// and their order change nothing.
     fn write_moments(
         &self,
         recording: &Recording,
@@ -221,7 +220,7 @@ impl Scene<'_, '_> {
     }
 }
 
-/// When the sweeps of a moment end, on the clock of the scene.
+/// End of the sweeps of a capture time, on the clock of the scene.
 pub(super) fn capture_nanos(frame: &RecordedFrame) -> u64 {
     frame.tick * STEP_NANOS
 }

@@ -1,4 +1,4 @@
-//! One moment of a scene as the sensors of its agents see it.
+//! Sensor simulation: the frames of all agents at one capture time.
 
 use nalgebra::Vector3;
 use protocol::{Handedness, PointCloud, Pose};
@@ -14,10 +14,10 @@ use super::vehicle::{Vehicle, VehicleKind};
 use dataset::frame::{Frame, Object, ObjectClass};
 use support::random::derive_seed;
 
-/// The farthest that any sensor looks, metres.
+/// Largest range of any sensor, metres.
 const SIGHT_M: f64 = 152.0;
 
-/// A vehicle that a sensor may see, as an annotation has it.
+/// A vehicle that a sensor may see, in the form of an annotation.
 #[derive(Debug, Clone, Copy)]
 struct Annotation<'a> {
     id: i64,
@@ -33,7 +33,7 @@ pub(super) struct Bench {
     radar: Radar,
 }
 
-/// Points of the LiDAR, copies of them in other weather, and how many of the points lie on each body.
+/// Points of the LiDAR, copies of them in other weather, and the number of points on each body.
 struct LidarSweeps {
     points: PointCloud,
     variants: Vec<SweepVariant>,
@@ -41,7 +41,7 @@ struct LidarSweeps {
 }
 
 impl Scene<'_, '_> {
-    /// All agents' frames of a moment.
+    /// The frames of all agents at a capture time.
     pub(super) fn moment(&self, recording: &Recording, agents: &[Agent], index: usize, bench: &mut Bench) -> Moment {
         let frames = agents.iter().enumerate().filter_map(|(place, agent)| {
             let own = recording.frames[index].of(agent.vehicle)?;
@@ -65,7 +65,7 @@ impl Scene<'_, '_> {
         let noise = |sensor: u64| derive_seed(self.spec.seed, &[sensor, agent.id as u64, moment.tick]);
         let LidarSweeps { points, variants, hits } = self.lidar_sweeps(&own.motion, &bodies, bench, &noise);
         let half_length_m = 0.5 * recording.vehicles[agent.vehicle].size_m[0];
-        // No other layout has a place for it.
+        // No other layout can hold radar.
         let has_radar = self.options.layout == SceneLayout::Opv2v;
         let radar = has_radar.then(|| self.radar_points(&own.motion, half_length_m, &bodies, bench, noise(6)));
 
@@ -106,7 +106,7 @@ impl Scene<'_, '_> {
         LidarSweeps { points, variants: variants.collect(), hits }
     }
 
-    /// The radar's points; the fourth value is the radial velocity as the red channel holds it.
+    /// The radar's points; the fourth value is the radial velocity as stored in the red channel.
     fn radar_points(
         &self,
         vehicle: &Sweep,
@@ -122,7 +122,7 @@ impl Scene<'_, '_> {
     }
 }
 
-/// The origin of a vehicle, and the way from there to the centre of its box.
+/// The origin of a vehicle, and the offset from there to the centre of its box.
 fn anchor(annotation: &Annotation<'_>) -> BoxAnchor {
     let up = annotation.placement.rotation() * Vector3::new(0.0, 0.0, annotation.vehicle.size_m[2] / 2.0);
     BoxAnchor { location_m: annotation.placement.position_m.into(), center_offset_m: up.into() }
@@ -150,7 +150,7 @@ fn class(kind: VehicleKind) -> ObjectClass {
     }
 }
 
-/// All vehicles but one's own that any sensor may see, as bodies and as what an annotation would say.
+/// All vehicles within sensor range except the sensor's own, as bodies and as annotations.
 fn vehicles_around<'a>(
     recording: &'a Recording,
     frame: &'a RecordedFrame,

@@ -1,7 +1,7 @@
-//! Rays against hilly ground: an exact walk over the triangles of a height grid.
+//! Ray casting on hilly ground: exact traversal of the triangles of a height grid.
 //!
-//! The rays of a column pass over the same strip of ground, the higher ones above the lower ones. So where the lower
-//! ray was still clear of everything around the strip, the higher one is too, and its walk begins farther out.
+//! The rays of a column pass over the same strip of ground, the higher ones above the lower ones. Where the lower ray
+//! was clear of everything around the strip, the higher one is too, and its traversal begins farther out.
 
 use nalgebra::Vector3;
 
@@ -10,14 +10,14 @@ use crate::map::{HeightGrid, Triangle};
 
 /// Length of the pieces of the strip under a column, metres.
 const PIECE_M: f64 = 4.0;
-/// The tops of the ground are known at least this far around every place, metres.
+/// The maximum height of the ground is known at least this far around every position, metres.
 const AROUND_M: f64 = 8.0;
-/// No ray is steeper than this (tangent of the elevation), which bounds how far a tilted sensor's rays leave the strip.
+/// Steepest ray (tangent of the elevation), which bounds how far a tilted sensor's rays leave the strip.
 const STEEPEST: f64 = 0.6;
 /// Thickness given to road surfaces above the terrain, metres.
 const DECK_M: f32 = 0.3;
 
-/// A height grid made ready for casting.
+/// A height grid prepared for ray casting.
 #[derive(Debug)]
 pub(crate) struct TerrainSurface {
     grid: HeightGrid,
@@ -189,7 +189,7 @@ impl Surface for TerrainSurface {
     }
 }
 
-/// The ground under a column, as far as its lower rays have been found clear of it.
+/// The ground under a column, up to the distance at which its lower rays are known to be clear.
 struct Strip<'a> {
     surface: &'a TerrainSurface,
     origin: [f64; 2],
@@ -199,7 +199,7 @@ struct Strip<'a> {
     /// Pieces that are clear, and the top of the next one.
     clear: usize,
     top_m: f64,
-    /// Whether all rays stay where the tops are known.
+    /// True if all rays stay where the maximum heights are known.
     is_narrow: bool,
 }
 
@@ -224,8 +224,8 @@ impl<'a> Strip<'a> {
         strip
     }
 
-    /// The distance up to which a ray is clear of the ground; nothing if it is as far as it goes, and then the rays above
-    /// it are too. `flat` is the share of the distance along the ground.
+    /// The distance up to which a ray is clear of the ground; `None` if it is clear over its whole length, and then the
+    /// rays above it are too. `flat` is the share of the distance along the ground.
     fn clear_m(&mut self, ray: &GridRay, flat: f64) -> Option<f64> {
         if !self.is_narrow || flat < 1e-3 {
             return Some(0.0);
@@ -331,7 +331,7 @@ mod tests {
     }
 
     #[test]
-    fn whole_columns_of_a_tilted_sensor_meet_what_single_rays_do() {
+    fn columns_of_a_tilted_sensor_hit_the_same_as_single_rays() {
         let mut random = SplitMix64::new(23);
         let elevations: Vec<f32> = (0..64).map(|channel| (-25.0 + 27.0 / 63.0 * channel as f32).to_radians()).collect();
         let cos: Vec<f32> = elevations.iter().map(|elevation| elevation.cos()).collect();

@@ -1,11 +1,11 @@
-//! What vehicles look like: convex parts that a LiDAR can tell from a box.
+//! Vehicle shapes: convex parts that a LiDAR can distinguish from a box.
 
 use std::f32::consts::PI;
 
 use super::raycast::{BodyShape, Bounds, Part};
 use support::random::SplitMix64;
 
-/// Kinds of vehicles on the roads of a town.
+/// Kinds of road vehicles.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum VehicleKind {
     /// Three boxes: bonnet, cabin, boot.
@@ -37,7 +37,7 @@ pub struct Vehicle {
     pub shape: BodyShape,
 }
 
-/// Mean sizes of a kind, how far an instance may differ from them (share), and how often it drives or parks.
+/// Mean sizes of a kind, the largest deviation of an instance (share), and the frequencies of driving and parking.
 struct Stock {
     kind: VehicleKind,
     size_m: [f64; 3],
@@ -101,13 +101,13 @@ const STOCK: [Stock; 7] = [
 ];
 
 impl Vehicle {
-    /// A vehicle as they drive around.
+    /// A random vehicle with the frequencies of moving traffic.
     #[must_use]
     pub fn random_driving(random: &mut SplitMix64) -> Self {
         Self::random(random, |stock| stock.driving)
     }
 
-    /// A vehicle as they stand at the kerb.
+    /// A random vehicle with the frequencies of parked vehicles.
     #[must_use]
     pub fn random_parked(random: &mut SplitMix64) -> Self {
         Self::random(random, |stock| stock.parked)
@@ -181,7 +181,7 @@ impl Vehicle {
     }
 }
 
-/// The outer box that a vehicle fills, metres.
+/// Outer box of a vehicle, metres.
 struct Form {
     half: f32,
     side: f32,
@@ -192,9 +192,9 @@ struct Form {
 struct Profile {
     /// Height of the lower edge of the windows.
     belt: f32,
-    /// How far the bonnet slopes down to the nose.
+    /// Drop of the bonnet towards the nose.
     bonnet: f32,
-    /// How far the tail slopes.
+    /// Drop of the tail.
     boot: f32,
     /// Rear and front of the cabin at the belt.
     cabin: [f32; 2],

@@ -1,21 +1,21 @@
-//! What fog and snow do to a beam.
+//! Weather model: the effect of fog and snow on a beam.
 //!
 //! Simplified from the simulations of Hahner et al. (fog, ICCV 2021; snowfall, CVPR 2022), ray by ray:
 //!
-//! - A solid target at range `R` with reflectivity `r` returns `r / R^2 * exp(-2 a R)`. It is seen where that is at least
-//!   what a target of 10 % returns in clear air at the sensor's range of 120 m. `a` is 0.06 per metre in fog (one sees
-//!   50 m far) and 0.008 per metre in snow.
-//! - Fog also answers by itself: a beam that lost its target, and now and then one that did not, returns a point from
+//! - A solid target at range `R` with reflectivity `r` returns `r / R^2 * exp(-2 a R)`. It is detected if that is at
+//!   least the return of a target of 10 % in clear air at the sensor's range of 120 m. `a` is 0.06 per metre in fog
+//!   (visibility 50 m) and 0.008 per metre in snow.
+//! - Fog also returns light: a beam without a detected target, and sometimes one with a target, returns a point from
 //!   the first metres of the fog (gamma law of shape 3, mean 5.4 m).
-//! - In snow a beam meets a flake after an exponential distance; flakes within 30 m that come before the target answer
-//!   in its place.
-//! - The intensity of what is left is dimmed by the same two-way loss; fog and flakes answer faintly.
+//! - In snow a beam hits a flake after an exponential distance; a flake within 30 m that is nearer than the target
+//!   replaces it.
+//! - The intensity of the remaining returns is reduced by the same two-way loss; fog and flakes have low intensities.
 
 use clap::ValueEnum;
 
 use support::random::SplitMix64;
 
-/// Share of light that a target must throw back to be seen in clear air at [`CLEAR_RANGE_M`].
+/// Reflectance of the weakest target that is detected in clear air at [`CLEAR_RANGE_M`].
 const WEAKEST_REFLECTIVITY: f32 = 0.1;
 /// Range of the sensor in clear air, metres.
 const CLEAR_RANGE_M: f32 = 120.0;
@@ -26,20 +26,20 @@ pub enum Weather {
     /// Clear air.
     #[default]
     Sunny,
-    /// Dense fog: one sees 50 m far.
+    /// Dense fog: visibility 50 m.
     Fog,
     /// Snowfall of about 2.5 mm of water per hour.
     Snow,
 }
 
-/// What became of a beam in the weather.
+/// Result of a beam in the weather.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Echo {
     /// The target, dimmed to this share of its intensity.
     Target(f32),
-    /// A point in the air: its range in metres and its intensity.
-    LinkEmulator(f32, f32),
-    /// Nothing.
+    /// Backscatter of fog or a flake: range in metres and intensity.
+    Backscatter(f32, f32),
+    /// No return.
     Lost,
 }
 
@@ -54,8 +54,8 @@ impl Weather {
         }
     }
 
-    /// The name of a sweep in this weather beside the plain one, as V2X-R has them: with the extinction of fog per metre,
-    /// with the rate of the snow in millimetres an hour and the speed of its flakes. Clear air has none.
+    /// The name of a sweep in this weather beside the clear one, as in V2X-R: with the extinction of fog per metre, or
+    /// with the rate of the snow in millimetres per hour and the speed of its flakes. Clear air has none.
     #[must_use]
     pub fn variant(self) -> Option<&'static str> {
         match self {
@@ -65,7 +65,7 @@ impl Weather {
         }
     }
 
-    /// What a beam returns whose target has this range (`None`: open sky) and reflectivity.
+    /// Return of a beam whose target has this range (`None`: open sky) and reflectivity.
     pub(crate) fn echo(self, target_m: Option<f32>, reflectivity: f32, random: &mut SplitMix64) -> Echo {
         match self {
             Self::Sunny => target_m.map_or(Echo::Lost, |_| Echo::Target(1.0)),
@@ -81,7 +81,7 @@ impl Weather {
             let product: f64 = (0..3).map(|_| 1.0 - random.unit()).product();
             let range_m = (1.0 - 1.8 * product.ln()) as f32;
             if target_m.is_none_or(|target_m| range_m < target_m) {
-                return Echo::LinkEmulator(range_m, random.between(0.02, 0.12) as f32);
+                return Echo::Backscatter(range_m, random.between(0.02, 0.12) as f32);
             }
         }
         target.map_or(Echo::Lost, Echo::Target)
@@ -90,13 +90,13 @@ impl Weather {
     fn snow(target_m: Option<f32>, reflectivity: f32, random: &mut SplitMix64) -> Echo {
         let flake_m = (1.5 - 110.0 * (1.0 - random.unit()).ln()) as f32;
         if flake_m < 30.0 && target_m.is_none_or(|target_m| flake_m < target_m) && random.chance(0.7) {
-            return Echo::LinkEmulator(flake_m, random.between(0.02, 0.25) as f32);
+            return Echo::Backscatter(flake_m, random.between(0.02, 0.25) as f32);
         }
         seen(target_m, reflectivity, 0.008).map_or(Echo::Lost, Echo::Target)
     }
 }
 
-/// The share of its light that a target keeps, where enough comes back to be seen.
+/// The share of the light that remains of a target, if that is enough for detection.
 fn seen(target_m: Option<f32>, reflectivity: f32, extinction: f32) -> Option<f32> {
     let range_m = target_m?;
     let kept = (-2.0 * extinction * range_m).exp();
@@ -115,14 +115,14 @@ mod tests {
     }
 
     #[test]
-    fn fog_hides_what_is_far_and_answers_itself() {
+    fn fog_hides_far_targets_and_backscatters() {
         let is_target = |echo: &Echo| matches!(echo, Echo::Target(_));
-        let is_air = |echo: &Echo| matches!(echo, Echo::LinkEmulator(..));
+        let is_backscatter = |echo: &Echo| matches!(echo, Echo::Backscatter(..));
         assert!(share(Weather::Fog, Some(15.0), is_target) > 0.95);
         assert_eq!(share(Weather::Fog, Some(60.0), is_target), 0.0);
-        assert!((share(Weather::Fog, Some(60.0), is_air) - 0.3).abs() < 0.02);
+        assert!((share(Weather::Fog, Some(60.0), is_backscatter) - 0.3).abs() < 0.02);
         assert!(share(Weather::Snow, Some(60.0), is_target) > 0.8);
-        assert!((0.08..0.25).contains(&share(Weather::Snow, None, is_air)));
+        assert!((0.08..0.25).contains(&share(Weather::Snow, None, is_backscatter)));
         assert_eq!(share(Weather::Sunny, Some(119.0), is_target), 1.0);
     }
 }

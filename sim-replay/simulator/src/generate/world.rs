@@ -1,11 +1,11 @@
-//! A town as the sensors see it.
+//! Scene geometry for ray casting and driving.
 
 use super::raycast::{Body, BodyShape, Bounds, Part, Placement, Plane, Surface, Sweep};
 use super::terrain::{TerrainSurface, deck_shape};
 use super::traffic::Roads;
 use crate::map::{LaneIndex, Shape, Solid, Terrain, Town};
 
-/// A town made ready for casting and driving.
+/// A map prepared for ray casting and driving.
 pub(crate) struct World<'t> {
     pub(crate) town: &'t Town,
     pub(crate) roads: Roads<'t>,
@@ -14,7 +14,7 @@ pub(crate) struct World<'t> {
     standing: Vec<Standing>,
 }
 
-/// Something that never moves.
+/// A static object.
 struct Standing {
     shape: BodyShape,
     placement: Placement,
@@ -42,7 +42,7 @@ impl<'t> World<'t> {
         &*self.ground
     }
 
-    /// Appends what stands within `radius_m` of a place.
+    /// Appends static objects within `radius_m` of a position.
     pub(crate) fn standing_near<'a>(&'a self, x_m: f64, y_m: f64, radius_m: f64, bodies: &mut Vec<Body<'a>>) {
         bodies.extend(self.standing.iter().filter_map(|standing| {
             let position = standing.placement.position_m;
@@ -53,7 +53,7 @@ impl<'t> World<'t> {
     }
 }
 
-/// The ground of a town, without its decks, as rays meet it.
+/// The ground of a map, without its decks, as a surface for ray casting.
 #[must_use]
 pub fn ground_surface(town: &Town) -> Box<dyn Surface + Send + Sync> {
     match &town.ground.terrain {

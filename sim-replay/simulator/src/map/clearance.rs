@@ -1,9 +1,9 @@
-//! Whether lanes are free of what stands beside and above them.
+//! Clearance check: finds solids that reach into the space of a lane.
 
 use super::convex::{CellIndex, Rectangle, bounds, overlap};
 use super::{LaneId, Shape, Solid, Town};
 
-/// Height over a lane in which nothing may stand, metres.
+/// Height over a lane that stays free of solids, metres.
 pub const LANE_HEADROOM_M: f64 = 4.5;
 /// Solids whose top is this little above a lane lie under it (slabs of bridges), metres.
 const SURFACE_M: f64 = 0.02;
@@ -19,8 +19,8 @@ pub(crate) fn outline(solid: &Solid) -> Rectangle {
 }
 
 impl Town {
-    /// Lanes and solids (by place in [`Town::solids`]) where the solid reaches into the lane's space up to
-    /// [`LANE_HEADROOM_M`] over it. Empty for a sound town.
+    /// Lanes and solids (by index in [`Town::solids`]) where the solid reaches into the lane's space up to
+    /// [`LANE_HEADROOM_M`] over it. Empty for a valid map.
     #[must_use]
     pub fn obstructions(&self) -> Vec<(LaneId, usize)> {
         let outlines: Vec<_> = self.solids.iter().map(|solid| outline(solid).corners()).collect();

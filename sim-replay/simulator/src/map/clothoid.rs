@@ -1,6 +1,6 @@
 //! One clothoid from a pose to a pose.
 //!
-//! The G1 Hermite problem: which clothoid leaves one place in a given heading and arrives at another in a given heading?
+//! The G1 Hermite problem: a clothoid that joins two positions with a given heading at each.
 //! With the chord as x axis and the parameter t from 0 to 1, the heading along it is
 //! `phi0 + (delta - a) t + a t^2`, where `phi0`, `phi1` are the headings against the chord and `delta = phi1 - phi0`;
 //! `a` is the root of the lateral offset at t = 1, found by Newton's method (Bertolazzi and Frego, "G1 fitting with

@@ -1,14 +1,14 @@
-//! Which lanes of a junction get in each other's way.
+//! Conflicts in junctions: pairs of lanes that cross or merge.
 
 use super::lane::{Lane, LaneGraph, LaneId};
 
-/// Lanes that pass each other at a greater height difference do not meet, metres.
+/// Lanes that pass each other at a greater height difference do not conflict, metres.
 const LEVEL_M: f64 = 3.0;
-/// Share of the mean width of two lanes within which their middles must come to be in conflict.
+/// Two lanes conflict if their centre lines come closer than this share of their mean width.
 const OVERLAP: f64 = 0.75;
 
-/// Fills [`Lane::conflicts`]: pairs of lanes of one junction that cross or merge. Lanes with a common predecessor part
-/// from each other and do not conflict, nor do neighbours that run side by side.
+/// Fills [`Lane::conflicts`]: pairs of lanes of one junction that cross or merge. Lanes with a common predecessor
+/// diverge and do not conflict, nor do neighbours that run side by side.
 pub(crate) fn find(graph: &mut LaneGraph) {
     let junction_count = graph.lanes.iter().filter_map(|lane| lane.junction).map(|j| j.0 as usize + 1).max();
     let mut members: Vec<Vec<usize>> = vec![Vec::new(); junction_count.unwrap_or(0)];

@@ -1,4 +1,4 @@
-//! Convex outlines in the plane, and a grid to find those near a place.
+//! Convex outlines in the plane, and a grid index over them.
 
 /// Corners of a convex quadrilateral, in order around it, metres.
 pub(crate) type Quad = [[f64; 2]; 4];
@@ -17,7 +17,7 @@ impl Rectangle {
         Self { half_m: self.half_m.map(|half| half + margin_m), ..*self }
     }
 
-    /// The place `u` along and `v` across, from the middle.
+    /// The position `u` along and `v` across, from the centre.
     pub(crate) fn at(&self, u: f64, v: f64) -> [f64; 2] {
         let (sin, cos) = self.yaw_rad.sin_cos();
         [self.center_m[0] + u * cos - v * sin, self.center_m[1] + u * sin + v * cos]
@@ -36,7 +36,7 @@ pub(crate) fn bounds(points: &[[f64; 2]]) -> [[f64; 2]; 2] {
     [low, high]
 }
 
-/// Whether two convex outlines have more than their edges in common (separating axes).
+/// True if two convex outlines have more than their edges in common (separating axes).
 pub(crate) fn overlap(a: &[[f64; 2]], b: &[[f64; 2]]) -> bool {
     !separated_by_edge_of(a, b) && !separated_by_edge_of(b, a)
 }
@@ -70,7 +70,7 @@ pub(crate) struct CellIndex {
 }
 
 impl CellIndex {
-    /// An empty index over a rectangle; what lies outside goes into the cells at its edge.
+    /// An empty index over a rectangle; outlines outside it go into the cells at its edge.
     pub(crate) fn new([low, high]: [[f64; 2]; 2], cell_m: f64) -> Self {
         // Huge maps get larger cells rather than more of them.
         let cell_m = cell_m.max((high[0] - low[0]).max(high[1] - low[1]) / 2000.0);
@@ -88,7 +88,7 @@ impl CellIndex {
         }
     }
 
-    /// Whether any outline whose cells touch the bounds answers `test` with yes. One may be asked several times.
+    /// True if `test` is true for any outline whose cells touch the bounds. One outline may be tested several times.
     pub(crate) fn any(&self, [low, high]: [[f64; 2]; 2], mut test: impl FnMut(u32) -> bool) -> bool {
         let ([c0, r0], [c1, r1]) = (self.cell(low), self.cell(high));
         (r0..=r1).any(|row| (c0..=c1).any(|column| self.cells[row * self.columns + column].iter().any(|&n| test(n))))
@@ -117,7 +117,7 @@ mod tests {
     }
 
     #[test]
-    fn index_finds_what_is_near_and_what_lies_outside() {
+    fn index_finds_outlines_near_and_outside() {
         let mut index = CellIndex::new([[0.0, 0.0], [100.0, 50.0]], 10.0);
         index.insert(1, [[12.0, 12.0], [28.0, 14.0]]);
         index.insert(2, [[-50.0, -50.0], [-40.0, -40.0]]);

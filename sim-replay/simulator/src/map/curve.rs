@@ -49,7 +49,7 @@ pub enum CurveShape {
         u: [f64; 4],
         /// Coefficients of v.
         v: [f64; 4],
-        /// Whether the parameter runs over 0 to 1 instead of 0 to the length.
+        /// True if the parameter runs over 0 to 1 instead of 0 to the length.
         normalized: bool,
     },
 }
@@ -68,7 +68,7 @@ pub struct Curve {
 }
 
 impl Pose2 {
-    /// A pose by its parts.
+    /// A pose from its coordinates.
     #[must_use]
     pub fn new(x: f64, y: f64, heading_rad: f64) -> Self {
         Self { x, y, heading_rad }

@@ -1,4 +1,4 @@
-//! Findings of a map: parts that were not built as the file gives them, each with what was done instead.
+//! Findings of a map: parts that were not built as the file gives them, each with the action taken.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -13,7 +13,7 @@ const MAX_TEXT: usize = 100;
 /// A part of a map that was left out, treated as absent or built otherwise than the file gives it.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Finding {
-    /// Line in the file, from 1; that of the first where there are several. 0 where it is about no single line.
+    /// Line in the file, from 1; the first of several. 0 if it concerns no single line.
     pub line: u32,
     /// Id of the road or junction in which it stands.
     pub within: Option<String>,
@@ -21,7 +21,7 @@ pub struct Finding {
     pub element: String,
     /// The value found.
     pub found: String,
-    /// What was done.
+    /// Action taken.
     pub action: String,
     /// Elements of this name, in this road, to which this happened.
     pub count: usize,
@@ -50,12 +50,12 @@ pub(super) struct FindingLog {
 }
 
 impl FindingLog {
-    /// Findings from here on stand in this road or junction.
+    /// Assigns further findings to this road or junction.
     pub(super) fn enter(&mut self, kind: &str, id: &str) {
         self.within = Some(format!("{kind} {}", shortened(id)));
     }
 
-    /// Findings from here on stand in the file as a whole.
+    /// Assigns further findings to the file as a whole.
     pub(super) fn leave(&mut self) {
         self.within = None;
     }
@@ -93,7 +93,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_same_in_one_road_is_counted_and_the_whole_is_bounded() {
+    fn repeated_findings_of_one_road_are_counted_and_the_total_is_bounded() {
         let mut log = FindingLog::default();
         log.enter("road", "7");
         (1..4).for_each(|line| log.add(line, "speed", "max=\"-1\"", "treated as absent"));

@@ -8,7 +8,7 @@ pub type Triangle = [[f64; 3]; 3];
 pub struct Ground {
     /// The surface that lies under everything.
     pub terrain: Terrain,
-    /// Road surfaces that pass above the terrain (bridges); empty in a flat town.
+    /// Road surfaces that pass above the terrain (bridges); empty on a flat map.
     pub decks: Vec<Triangle>,
 }
 

@@ -1,8 +1,8 @@
-//! Lanes and how they hang together.
+//! Lanes and the links between them.
 
 use std::f64::consts::PI;
 
-/// A lane by its place in [`LaneGraph::lanes`].
+/// A lane by its index in [`LaneGraph::lanes`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct LaneId(pub u32);
 
@@ -10,7 +10,7 @@ pub struct LaneId(pub u32);
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct JunctionId(pub u32);
 
-/// Which way a lane leads through a junction.
+/// Direction in which a lane leads through a junction.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub enum Turn {
     /// Ahead, and every lane outside junctions.
@@ -21,7 +21,7 @@ pub enum Turn {
     Right,
 }
 
-/// All driving lanes of a town.
+/// All driving lanes of a map.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct LaneGraph {
     /// The lanes; `lanes[i].id == LaneId(i)`.
@@ -31,9 +31,10 @@ pub struct LaneGraph {
 /// A stretch of driving lane without branches inside.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Lane {
-    /// Its own place in the graph.
+    /// Its own index in the graph.
     pub id: LaneId,
-    /// Middle of the lane, in driving direction, at even steps of about 1 m (at least two points), metres in the world frame.
+    /// Middle of the lane, in driving direction, at even steps of about 1 m (at least two points), metres in the world
+    /// frame.
     pub centerline: Vec<[f64; 3]>,
     /// Length of the centre line in the plane, metres.
     pub length_m: f64,
@@ -54,11 +55,11 @@ pub struct Lane {
     pub left: Option<LaneId>,
     /// Neighbour to the right that leads the same way.
     pub right: Option<LaneId>,
-    /// Whether it lies inside a junction.
+    /// True if it lies inside a junction.
     pub in_junction: bool,
     /// The junction it lies in.
     pub junction: Option<JunctionId>,
-    /// Which way it leads through its junction.
+    /// Direction in which it leads through its junction.
     pub turn: Turn,
     /// Lanes of the same junction that cross it or end where it ends (not those that begin together with it); give way
     /// by these.
@@ -142,14 +143,14 @@ impl LaneGraph {
         Self { lanes }
     }
 
-    /// The lane of an id that this graph gave out.
+    /// The lane of an id that belongs to this graph.
     #[must_use]
     pub fn lane(&self, id: LaneId) -> &Lane {
         &self.lanes[id.0 as usize]
     }
 }
 
-/// Takes an angle into (-pi, pi].
+/// Normalises an angle to (-pi, pi].
 #[must_use]
 pub(crate) fn wrap_angle(angle_rad: f64) -> f64 {
     let wrapped = angle_rad.rem_euclid(2.0 * PI);

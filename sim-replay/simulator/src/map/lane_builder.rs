@@ -1,4 +1,4 @@
-//! From a road network to a lane graph.
+//! Lane builder: makes a lane graph from a road network.
 
 use super::conflicts;
 use super::lane::{JunctionId, Lane, LaneGraph, LaneId, Turn, wrap_angle};
@@ -9,7 +9,7 @@ use super::road::{Contact, LaneKind, Road, RoadNetwork};
 const FINE_STEP_M: f64 = 0.25;
 /// Distance between points of a centre line, about, metres.
 const STEP_M: f64 = 1.0;
-/// Where neither lane nor road has a speed limit, metres per second.
+/// Speed limit where neither lane nor road has one, metres per second.
 const DEFAULT_LIMIT_MPS: f64 = 13.9;
 /// Lanes that change heading by more than this through a junction turn off, radians.
 const TURN_RAD: f64 = 0.52;
@@ -22,7 +22,7 @@ pub(super) struct LaneTable {
     ids: Vec<(i32, Vec<Option<LaneId>>)>,
 }
 
-/// Where a lane of the graph comes from.
+/// Origin of a lane of the graph in the road network.
 #[derive(Clone, Copy)]
 pub(super) struct Origin {
     pub(super) road: usize,
@@ -30,8 +30,8 @@ pub(super) struct Origin {
     pub(super) lane: i32,
 }
 
-/// Builds the driving lanes of `network` and their links. Which lanes lead along their road and which against it is
-/// [`Road::leads_along`]'s answer: traffic keeps right or left, road by road.
+/// Builds the driving lanes of `network` and their links. [`Road::leads_along`] gives the direction of each lane:
+/// traffic keeps right or left, road by road.
 #[must_use]
 pub fn lane_graph(network: &RoadNetwork) -> (LaneGraph, LinkCounts) {
     let mut table = LaneTable { first_section: Vec::new(), ids: Vec::new() };
@@ -143,7 +143,7 @@ fn center_line(road: &Road, origin: Origin, from: f64, to: f64) -> Option<Center
         lengths.push(lengths[lengths.len() - 1] + (b[0] - a[0]).hypot(b[1] - a[1]));
     }
     let total = lengths[fine];
-    // Far longer than the road: polynomials of the map went astray between the places where the reader checks them.
+    // Far longer than the road: polynomials of the map diverge between the places where the reader checks them.
     if total < 1e-6 || total > 10.0 * (to - from) + 100.0 {
         return None;
     }

@@ -1,4 +1,4 @@
-//! How the lanes of a map hang together: neighbours, successors, and links that do not hold.
+//! Links between the lanes of a map: neighbours, successors, and links that are refused.
 
 use super::finding::{Finding, FindingLog};
 use super::lane::{Lane, LaneGraph, LaneId, wrap_angle};
@@ -14,7 +14,7 @@ const LINK_TURN_RAD: f64 = 0.35;
 /// Narrower lanes are not linked unless the map does so, metres.
 const LEAST_WIDTH_M: f64 = 1.0;
 
-/// What came out of the links of a map.
+/// Result of linking the lanes of a map.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct LinkCounts {
     /// Links made.
@@ -66,7 +66,7 @@ pub(super) fn link_successors(
             }
         }
         if let Some(next) = successors.is_empty().then(|| same_lane_on(graph, network, origin, table)).flatten() {
-            let found = format!("leads from lane {} to no lane, though lane {} goes on", origin.lane, origin.lane);
+            let found = format!("leads from lane {} to no lane, though lane {} continues", origin.lane, origin.lane);
             log.add(0, "link", &found, "lanes of one id linked");
             counts.made += 1;
             successors.push(next);
@@ -169,7 +169,7 @@ fn linked<'a>(
     connection.lane_links.iter().filter_map(pick).chain(same)
 }
 
-/// How far the end of one lane is from the beginning of the other.
+/// Gap between the end of one lane and the beginning of the other, as text.
 fn apart(lane: &Lane, next: &Lane) -> String {
     let (end, start) = (lane.centerline[lane.centerline.len() - 1], next.centerline[0]);
     let (beside, step) = ((end[0] - start[0]).hypot(end[1] - start[1]), (end[2] - start[2]).abs());
@@ -177,7 +177,7 @@ fn apart(lane: &Lane, next: &Lane) -> String {
     format!("{beside:.2} m away, {step:.2} m in height, turned by {turn:.2} rad")
 }
 
-/// Whether one lane ends where the other begins, in place and heading.
+/// True if one lane ends where the other begins, in place and heading.
 fn meets(lane: &Lane, next: &Lane) -> bool {
     let (end, start) = (lane.centerline[lane.centerline.len() - 1], next.centerline[0]);
     let (beside, step) = ((end[0] - start[0]).hypot(end[1] - start[1]), (end[2] - start[2]).abs());

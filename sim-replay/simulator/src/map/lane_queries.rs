@@ -1,11 +1,11 @@
-//! Which lane is near.
+//! Lane queries: the nearest lane to a position.
 
 use super::lane::{Lane, LaneGraph, LaneId, wrap_angle};
 
 /// Edge of a cell of the index, metres.
 const CELL_M: f64 = 8.0;
 
-/// A place on a lane.
+/// A position on a lane.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LanePosition {
     /// The lane.
@@ -113,7 +113,7 @@ impl LaneIndex {
     }
 }
 
-/// The place on `lane` nearest to `x`, `y`, looked for on the two steps around a point of its centre line.
+/// The position on `lane` nearest to `x`, `y`, searched on the two steps around a point of its centre line.
 fn project_near(lane: &Lane, place: usize, x: f64, y: f64) -> LanePosition {
     let steps = lane.centerline.len() - 1;
     let step_m = lane.length_m / steps as f64;

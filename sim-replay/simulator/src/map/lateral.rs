@@ -10,7 +10,7 @@ pub(super) const MAX_SLOPE_RAD: f64 = 1.4;
 /// Highest place of a shape over the reference line, metres.
 pub(super) const MAX_SHAPE_M: f64 = 100.0;
 
-/// How the surface of a road lies across it; level where all is empty.
+/// Shape of the surface of a road across it; level where all is empty.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct LateralProfile {
     /// Turn about the reference line, radians; positive lifts the left side.
@@ -31,13 +31,13 @@ pub struct CrossShape {
 }
 
 impl LateralProfile {
-    /// Whether the road is level everywhere.
+    /// True if the road is level everywhere.
     #[must_use]
     pub fn is_level(&self) -> bool {
         self.superelevation_rad.records.is_empty() && self.is_flat()
     }
 
-    /// Whether every cross-section is a straight line, level or not.
+    /// True if every cross-section is a straight line, level or not.
     #[must_use]
     pub fn is_flat(&self) -> bool {
         self.crossfall_rad.iter().all(|side| side.records.is_empty()) && self.shapes.is_empty()

@@ -1,7 +1,7 @@
-//! Everything that stands still: roads, ground, buildings and street furniture of a town.
+//! Static scene: roads, ground, buildings and street furniture.
 //!
-//! A [`Town`] is made from a source (one of two procedural kinds, or an OpenDRIVE map) and a seed, and is the same
-//! for the same two, byte for byte. Routes, traffic and parked cars come later and from another seed.
+//! A [`Town`] is made from a source (one of two procedural kinds, or an OpenDRIVE map) and a seed; the same source and
+//! seed give the same result, byte for byte. Routes, traffic and parked cars are generated later from another seed.
 //!
 //! # Frames and units
 //! World frame of the map: right-handed, x east, y north, z up, metres; yaw turns x towards y.
@@ -43,27 +43,27 @@ use surface::Surface;
 
 use support::bounded_file;
 
-/// Longest side of a town, metres.
+/// Longest side of a map, metres.
 const MAX_EXTENT_M: f64 = 50_000.0;
 
-/// Everything that stands still.
+/// All static parts of a scene.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Town {
-    /// Kind or map the town was made from, such as `town1` or the stem of the map's file.
+    /// Kind of procedural map, such as `town1`, or the stem of the map's file.
     pub name: String,
-    /// Where vehicles drive.
+    /// Driving lanes.
     pub lanes: LaneGraph,
     /// Terrain and elevated road surfaces.
     pub ground: Ground,
     /// Buildings, trees, poles, walls, bridges.
     pub solids: Vec<Solid>,
-    /// Where vehicles may stand.
+    /// Places for parked vehicles.
     pub parking: Vec<ParkingSpot>,
     /// Parts of its map that were not built as the file gives them.
     pub findings: Vec<Finding>,
 }
 
-/// What a town is made from.
+/// Source of a map.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum TownSource {
     /// A small town with T-junctions and crossings.
@@ -75,7 +75,7 @@ pub enum TownSource {
 }
 
 impl TownSource {
-    /// The name of the town made from it: its kind, or the stem of the map's file in small letters.
+    /// The name of the map made from it: its kind, or the stem of the map's file in small letters.
     #[must_use]
     pub fn name(&self) -> String {
         let stem = |path: &Path| path.file_stem().map(|stem| stem.to_string_lossy().to_lowercase());
@@ -102,7 +102,7 @@ pub struct ParkingSpot {
     pub width_m: f64,
 }
 
-/// Why a town could not be made.
+/// Reasons why a map cannot be built.
 #[derive(Debug, thiserror::Error)]
 pub enum TownError {
     /// The map's file could not be read.
@@ -110,7 +110,7 @@ pub enum TownError {
     Read {
         /// The map's file.
         path: PathBuf,
-        /// What the system says.
+        /// Error of the operating system.
         source: std::io::Error,
     },
     /// The map's file is not a usable OpenDRIVE map.
@@ -118,7 +118,7 @@ pub enum TownError {
     OpenDrive {
         /// The map's file.
         path: PathBuf,
-        /// What is wrong, and where.
+        /// The fault, with its position in the file.
         source: OpenDriveError,
     },
     /// The map has no lane to drive on.
@@ -129,22 +129,22 @@ pub enum TownError {
         /// Number of roads.
         roads: usize,
     },
-    /// The map is larger than a town.
+    /// The map is larger than the limit.
     #[error("{}: its lanes reach over {extent_m:.0} m, more than the limit of {limit_m} m", path.display())]
     TooLarge {
         /// The map's file.
         path: PathBuf,
         /// Longer side of the rectangle around its lanes, metres.
         extent_m: f64,
-        /// Longest side of a town, metres.
+        /// Longest side of a map, metres.
         limit_m: f64,
     },
 }
 
-/// Builds the town of `source` and `town_seed`.
+/// Builds the map of `source` and `town_seed`.
 ///
 /// # Errors
-/// [`TownError`] when a map cannot be read or is no usable road network; procedural towns always build.
+/// [`TownError`] when a map cannot be read or is no usable road network; procedural maps always build.
 pub fn build(source: &TownSource, town_seed: u64) -> Result<Town, TownError> {
     let name = source.name();
     match source {
@@ -175,10 +175,10 @@ fn check_extent(path: &Path, network: &RoadNetwork, graph: &LaneGraph) -> Result
     Ok(())
 }
 
-/// A map as its file gives it.
+/// A map as read from its file.
 #[derive(Debug, Clone)]
 pub struct Map {
-    /// Its roads and junctions, with what was not built as the file gives it.
+    /// Its roads and junctions, with findings of parts that were not built as the file gives them.
     pub network: RoadNetwork,
     /// Its driving lanes.
     pub lanes: LaneGraph,
@@ -224,9 +224,9 @@ mod tests {
         }
     }
 
-    /// Scenes of a seed are the same from one version to the next only in the same towns.
+    /// Scenes of a seed are the same from one version to the next only if the procedural maps are the same.
     #[test]
-    fn our_own_towns_stay_what_they_are() {
+    fn procedural_maps_are_unchanged() {
         for (source, counts, sums) in [
             (TownSource::Town1, [168, 4221, 445, 0], [4735203.0653, 2410977.6519, 244239.8916]),
             (TownSource::Town4, [172, 11365, 286, 192], [2554837.7919, 1465742.7106, 139175.4820]),

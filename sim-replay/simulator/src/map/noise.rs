@@ -1,4 +1,4 @@
-//! Smooth randomness over the plane.
+//! Smooth noise over the plane.
 
 /// Height of the hills at a place, metres; from about -3 to 9, features of some 60 to 150 m.
 pub(crate) fn hills_m(x: f64, y: f64, seed: u64) -> f64 {

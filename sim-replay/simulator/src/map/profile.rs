@@ -1,4 +1,4 @@
-//! Values along a road, as OpenDRIVE gives them: cubics, one after another.
+//! Values along a road in OpenDRIVE's form: piecewise cubics.
 
 use super::curve::{cubic, cubic_slope};
 

@@ -8,7 +8,7 @@ use super::finding::Finding;
 use super::lateral::LateralProfile;
 use super::profile::Profile;
 
-/// Farthest that lanes may lie beside the reference line, metres.
+/// Largest distance of lanes from the reference line, metres.
 pub(super) const MAX_OFFSET_M: f64 = 1000.0;
 /// Widest lane, metres.
 pub(super) const MAX_WIDTH_M: f64 = 100.0;
@@ -31,13 +31,13 @@ pub struct Road {
     pub id: String,
     /// Length along the reference line, metres.
     pub length_m: f64,
-    /// Whether traffic keeps left: lanes with positive ids lead along the road. Else it keeps right.
+    /// True if traffic keeps left: lanes with positive ids lead along the road. Else it keeps right.
     pub left_hand: bool,
     /// The junction that it leads through.
     pub junction: Option<usize>,
-    /// What its start meets.
+    /// Link at its start.
     pub predecessor: Option<RoadLink>,
-    /// What its end meets.
+    /// Link at its end.
     pub successor: Option<RoadLink>,
     /// Elements of the reference line, by rising `s`; at least one.
     pub plan_view: Vec<Curve>,
@@ -51,41 +51,41 @@ pub struct Road {
     pub sections: Vec<LaneSection>,
     /// Speed limits in metres per second, by rising `s` of their start.
     pub speed_limits: Vec<(f64, f64)>,
-    /// Things beside or on the road that the map records.
+    /// Objects beside or on the road in the map.
     pub objects: Vec<RoadObject>,
-    /// Traffic lights and signs that the map records.
+    /// Traffic lights and signs in the map.
     pub signals: Vec<RoadSignal>,
-    /// Stretches on bridges and in tunnels that the map records.
+    /// Stretches on bridges and in tunnels in the map.
     pub structures: Vec<RoadStructure>,
 }
 
-/// What the end of a road meets.
+/// Link at an end of a road.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum RoadLink {
     /// Another road's start or end.
     Road {
         /// The other road.
         road: usize,
-        /// Which of its ends.
+        /// End of the other road.
         contact: Contact,
     },
-    /// A junction, whose connections say how to go on.
+    /// A junction; its connections give the roads that follow.
     Junction(usize),
 }
 
 /// An end of a road.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Contact {
-    /// Where `s` is 0.
+    /// End at `s = 0`.
     Start,
-    /// Where `s` is the road's length.
+    /// End at `s` = length of the road.
     End,
 }
 
 /// Lanes across a stretch of road.
 #[derive(Debug, Clone, Default)]
 pub struct LaneSection {
-    /// Where it starts, metres.
+    /// Start along the road, metres.
     pub s_m: f64,
     /// Lanes 1, 2, .. outwards.
     pub left: Vec<RoadLane>,
@@ -96,7 +96,7 @@ pub struct LaneSection {
 /// One lane of a section.
 #[derive(Debug, Clone)]
 pub struct RoadLane {
-    /// What it is for.
+    /// Use of the lane.
     pub kind: LaneKind,
     /// Width along the section, `s` counted from the section's start.
     pub width: Profile,
@@ -106,9 +106,9 @@ pub struct RoadLane {
     pub successor: Option<i32>,
     /// Its own speed limit, metres per second.
     pub speed_limit_mps: Option<f64>,
-    /// Whether it is level, with all lanes outside it, at the height of its inner border.
+    /// True if it is level, with all lanes outside it, at the height of its inner border.
     pub level: bool,
-    /// Whether traffic leads against the direction of its side.
+    /// True if traffic leads against the direction of its side.
     pub reversed: bool,
 }
 
@@ -120,7 +120,7 @@ impl RoadLane {
     }
 }
 
-/// What a lane is for.
+/// Use of a lane.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum LaneKind {
     /// Motor traffic, ramps included.
@@ -137,18 +137,18 @@ pub enum LaneKind {
     Other,
 }
 
-/// A junction and the ways through it.
+/// A junction and its connections.
 #[derive(Debug, Clone, Default)]
 pub struct Junction {
     /// Its id in the map.
     pub id: String,
-    /// Whether its connections join two roads directly, for both directions, without a road inside the junction.
+    /// True if its connections join two roads directly, for both directions, without a road inside the junction.
     pub direct: bool,
-    /// The ways through it.
+    /// Connections through it.
     pub connections: Vec<Connection>,
 }
 
-/// A way from an incoming road onto a connecting road.
+/// A connection from an incoming road onto a connecting road.
 #[derive(Debug, Clone)]
 pub struct Connection {
     /// The road that leads into the junction.
@@ -161,10 +161,10 @@ pub struct Connection {
     pub lane_links: Vec<(i32, i32)>,
 }
 
-/// A thing that a map records beside or on a road.
+/// An object of the map beside or on a road.
 #[derive(Debug, Clone)]
 pub struct RoadObject {
-    /// Its type and name, as the map gives them.
+    /// Type and name in the map.
     pub label: String,
     /// Place along the road, metres.
     pub s_m: f64,
@@ -178,12 +178,12 @@ pub struct RoadObject {
     pub size_m: [f64; 3],
 }
 
-/// A traffic light or sign that a map records.
+/// A traffic light or sign of the map.
 #[derive(Debug, Clone)]
 pub struct RoadSignal {
-    /// Name, as the map gives it.
+    /// Name in the map.
     pub name: String,
-    /// Whether it changes: a traffic light.
+    /// True if it changes (a traffic light).
     pub dynamic: bool,
     /// Place along the road, metres.
     pub s_m: f64,
@@ -193,16 +193,16 @@ pub struct RoadSignal {
     pub z_offset_m: f64,
     /// Heading against the road, radians.
     pub heading_rad: f64,
-    /// Height, metres; 0 when the map does not say.
+    /// Height, metres; 0 if the map gives none.
     pub height_m: f64,
 }
 
 /// A stretch of road on a bridge or in a tunnel.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RoadStructure {
-    /// Whether it is a tunnel; else a bridge.
+    /// True if it is a tunnel; else a bridge.
     pub tunnel: bool,
-    /// Where it starts, metres.
+    /// Start along the road, metres.
     pub s_m: f64,
     /// Length, metres.
     pub length_m: f64,
@@ -216,7 +216,7 @@ impl LaneSection {
         side.get((id.unsigned_abs() as usize).checked_sub(1)?)
     }
 
-    /// Whether lanes are kept level where the road is not.
+    /// True if lanes are kept level where the road is not.
     #[must_use]
     pub fn has_level_lanes(&self) -> bool {
         self.left.iter().chain(&self.right).any(|lane| lane.level)
@@ -291,7 +291,7 @@ impl Road {
         (left[1] - right[1]).atan2(left[0] - right[0])
     }
 
-    /// Whether traffic on lane `id` of section `section` leads along the road.
+    /// True if traffic on lane `id` of section `section` leads along the road.
     #[must_use]
     pub fn leads_along(&self, section: usize, id: i32) -> bool {
         let reversed =
@@ -305,14 +305,14 @@ impl Road {
         self.sections.get(index + 1).map_or(self.length_m, |next| next.s_m.min(self.length_m))
     }
 
-    /// Place of the section at `s_m` in [`Road::sections`].
+    /// Index of the section at `s_m` in [`Road::sections`].
     #[must_use]
     pub fn section_at(&self, s_m: f64) -> usize {
         self.sections.partition_point(|section| section.s_m <= s_m).saturating_sub(1)
     }
 
-    /// Shift of the lanes' origin across the road at `s_m`, metres. Cubics of a map can lead anywhere: it is held within
-    /// what a road can be.
+    /// Shift of the lanes' origin across the road at `s_m`, metres, clamped to the limits of a road since cubics of a
+    /// map are unbounded.
     #[must_use]
     pub fn lane_offset_m(&self, s_m: f64) -> f64 {
         self.lane_offset.at(s_m).clamp(-MAX_OFFSET_M, MAX_OFFSET_M)

@@ -1,6 +1,6 @@
 //! Solid things beside and above the road.
 
-/// What a solid is; decides how it answers a beam and what it may stand next to.
+/// Kind of a solid; determines its reflectivity and the objects allowed beside it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 #[non_exhaustive]
 pub enum SolidKind {
@@ -79,7 +79,7 @@ impl Shape {
 /// One solid in the world.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Solid {
-    /// What it is.
+    /// Kind of the solid.
     pub kind: SolidKind,
     /// Its shape in its own frame.
     pub shape: Shape,
@@ -87,7 +87,7 @@ pub struct Solid {
     pub center_m: [f64; 3],
     /// Turn of its own x axis from the world's, radians.
     pub yaw_rad: f64,
-    /// Share of near-infrared light that it throws back, 0 to 1.
+    /// Reflectance in the near infrared, 0 to 1.
     pub reflectivity: f32,
 }
 

@@ -1,4 +1,4 @@
-//! What roads cover: quadrilaterals across every road, by use.
+//! Road surfaces: quadrilaterals across every road, by use.
 
 use super::convex::{CellIndex, Quad, Rectangle, bounds, overlap};
 use super::curve::Pose2;
@@ -13,7 +13,7 @@ const PIECE_M: f64 = 1.0;
 /// Most pieces across one strip of such a road, and of all of them together.
 const MAX_PIECES: f64 = 64.0;
 const MAX_ALL_PIECES: f64 = 2e6;
-/// How far a slope across goes on beside the road, metres.
+/// Distance for which a slope across continues beside the road, metres.
 const BESIDE_M: f64 = 4.0;
 /// Most cells of the index that all patches together may touch: some 100 MB.
 const MAX_TOUCHED: f64 = 2e7;
@@ -26,11 +26,11 @@ pub(crate) struct CrossSection {
     pub pose: Pose2,
     /// Height of the reference line.
     pub z_m: f64,
-    /// Two places across a road that is not level, the outermost paved ones: `t`, distance beside the reference line and
-    /// height over it, metres.
+    /// Two places across a road that is not level, the outermost paved ones: `t`, distance beside the reference line
+    /// and height over it, metres.
     bank: Option<[[f64; 3]; 2]>,
-    /// Lowest and highest `t` of what vehicles drive on: driving lanes, shoulders, parking lanes; metres. Equal where
-    /// there is none.
+    /// Lowest and highest `t` of the carriageway: driving lanes, shoulders, parking lanes; metres. Equal where there is
+    /// none.
     pub carriageway_m: [f64; 2],
     /// The same with pavements and verges.
     pub paved_m: [f64; 2],
@@ -48,7 +48,7 @@ pub(crate) struct Patch {
     /// Highest place of the whole road between the two cross-sections, metres.
     pub top_m: f64,
     pub road: u32,
-    /// Whether vehicles drive here; else pavement or verge.
+    /// True if vehicles drive here; else pavement or verge.
     pub carriageway: bool,
 }
 
@@ -166,7 +166,7 @@ impl Surface {
         Self { roads, patches, index, bounds_m }
     }
 
-    /// Whether any patch that overlaps `rectangle` answers `test` with yes.
+    /// True if `test` is true for any patch that overlaps `rectangle`.
     pub(crate) fn any(&self, rectangle: &Rectangle, mut test: impl FnMut(&Patch) -> bool) -> bool {
         let corners = rectangle.corners();
         self.index.any(bounds(&corners), |number| {
@@ -175,8 +175,8 @@ impl Surface {
         })
     }
 
-    /// Whether something from `bottom_m` to `top_m` over `rectangle` keeps clear of every road: above `headroom_m` over
-    /// its surface, or wholly below it. Pavements count only when `pavements` says so.
+    /// True if an object from `bottom_m` to `top_m` over `rectangle` keeps clear of every road: above `headroom_m` over
+    /// its surface, or wholly below it. Pavements count only if `pavements` is set.
     pub(crate) fn is_clear(
         &self,
         rectangle: &Rectangle,
@@ -191,7 +191,8 @@ impl Surface {
     }
 }
 
-/// Most pieces across one strip: fewer where a map has so many roads that are not level that they would fill the memory.
+/// Most pieces across one strip: fewer where so many roads of a map are not level that the pieces would exhaust the
+/// memory.
 fn most_pieces(network: &RoadNetwork) -> f64 {
     let banked = network.roads.iter().filter(|road| !road.lateral.is_level());
     let cuts: f64 = banked.map(|road| road.length_m / STEP_M + road.sections.len() as f64).sum();
@@ -224,8 +225,8 @@ fn strips(
     }
 }
 
-/// Edge of the cells of a grid over all patches, metres: `least_m`, or more where a map has surfaces so wide, and askew,
-/// that as many cells as they touch would fill the memory or take minutes to go through.
+/// Edge of the cells of a grid over all patches, metres: `least_m`, or more where surfaces are so wide and skewed that
+/// the cells they touch would exhaust the memory or take minutes to visit.
 pub(super) fn cell_m(patches: &[Patch], least_m: f64) -> f64 {
     let touched = |cell_m: f64| -> f64 {
         let boxes = patches.iter().map(|patch| bounds(&patch.quad));
@@ -252,7 +253,7 @@ fn cross_sections(road: &Road) -> Vec<CrossSection> {
     cuts
 }
 
-/// The cut at `s_m`, with widths taken at `inside_m`, which lies in the section for certain.
+/// The cut at `s_m`, with widths taken at `inside_m`, which always lies in the section.
 fn cut(road: &Road, section: usize, s_m: f64, inside_m: f64) -> CrossSection {
     let origin = road.lane_offset_m(inside_m);
     let range = |wanted: fn(LaneKind) -> bool| {

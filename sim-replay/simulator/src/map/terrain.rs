@@ -1,5 +1,5 @@
-//! The ground from the roads: level or shaped to meet every road, with hills away from them, and decks where a road
-//! passes above.
+//! Terrain from roads: level or shaped to meet every road, with hills away from them, and decks where a road passes
+//! above.
 
 use super::convex::{Quad, Rectangle, bounds, overlap};
 use super::ground::{Ground, HeightGrid, Terrain, Triangle};
@@ -11,19 +11,19 @@ use super::surface::{Patch, Surface, cell_m};
 const CELL_M: f64 = 2.0;
 /// Most nodes of a terrain.
 const MAX_NODES: f64 = 4e6;
-/// How far the terrain reaches beyond the roads, metres; a LiDAR sees 120 m, a radar 150 m.
+/// Distance to which the terrain reaches beyond the roads, metres; the range of a LiDAR is 120 m, of a radar 150 m.
 const MARGIN_M: f64 = 160.0;
 /// Roads within this of one height lie on level ground, metres.
 const LEVEL_M: f64 = 0.05;
 /// A road surface this far above the terrain becomes a deck, metres.
 const DECK_M: f64 = 0.12;
-/// Where hills begin and where they are full, distance from the nearest road in metres.
+/// Distances from the nearest road at which hills begin and reach full height, metres.
 const HILLS_FROM_M: [f64; 2] = [14.0, 90.0];
 /// Roads that differ by more than this at one place pass above each other, metres.
 const LEVELS_M: f32 = 0.8;
 /// A road this far above another is on a bridge near it, metres.
 const BRIDGE_M: f32 = 4.0;
-/// How far bridges reach beyond the lower road's edges, metres.
+/// Distance by which bridges reach beyond the lower road's edges, metres.
 const OPENING_M: f64 = 8.0;
 /// Rounds of smoothing at each level between the roads.
 const SMOOTHING: usize = 12;
@@ -75,7 +75,7 @@ fn fix_under_roads(grid: &mut HeightGrid, surface: &Surface) -> Vec<bool> {
     grid.heights_m.iter().map(|height| !height.is_nan()).collect()
 }
 
-/// Lets go of nodes that an upper road has set close to a lower one, so that bridges reach beyond the lower road's edges.
+/// Clears nodes that an upper road has set close to a lower one, so that bridges reach beyond the lower road's edges.
 fn open_under_bridges(grid: &mut HeightGrid, surface: &Surface) {
     for patch in &surface.patches {
         let level = patch.top_m as f32;
@@ -241,7 +241,7 @@ fn decks(grid: &HeightGrid, surface: &Surface) -> Vec<Triangle> {
     triangles
 }
 
-/// Whether a patch lies above the terrain anywhere.
+/// True if a patch lies above the terrain anywhere.
 pub(crate) fn is_deck(patch: &Patch, height_m: impl Fn(f64, f64) -> f64) -> bool {
     let [a, b, c, d] = patch.quad;
     let middle = |p: [f64; 2], q: [f64; 2]| [(p[0] + q[0]) / 2.0, (p[1] + q[1]) / 2.0];

@@ -1,4 +1,4 @@
-//! Fitting a confidence to sweeps whose poses are known.
+//! Fit of a confidence model on sweeps with known poses.
 
 use nalgebra::{SMatrix, SVector};
 use serde::Serialize;
@@ -7,54 +7,54 @@ use super::isotonic::MonotoneMap;
 use super::{ConfidenceModel, FEATURES, features};
 use crate::pgc::pose_evidence::PoseEvidence;
 
-/// A pose farther off than this is bad, metres: the paper's limit of success.
+/// Error above which a pose is bad, metres: the paper's limit of success.
 pub const BAD_M: f64 = 3.0;
 
 /// Fewest sweeps to fit on.
 const MIN_SWEEPS: usize = 40;
-/// Errors below this are all the same to those who use a pose, metres.
+/// Smallest error that is distinguished, metres.
 const SMALLEST_ERROR_M: f64 = 0.01;
-/// Strength of the pull of weights towards 0, per sweep.
+/// Strength of the ridge penalty, per sweep.
 const RIDGE: f64 = 1e-3;
 /// Rounds of coordinate descent; it converges in some hundred.
 const ROUNDS: usize = 2000;
-/// Groups of sweeps that the map to sigma is fitted on, and the fewest sweeps in one.
+/// Groups of sweeps that the isotonic function to sigma is fitted on, and the fewest sweeps in one.
 const GROUPS: (usize, usize) = (24, 8);
 
-/// A pose that was found for a sweep, and how far off it is.
+/// A pose estimated for a sweep, with its error.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Labelled {
-    /// What speaks for it.
+    /// Evidence for the pose.
     pub evidence: PoseEvidence,
     /// Distance to the true position, metres.
     pub error_m: f64,
 }
 
-/// What a fit has to say of itself.
+/// Results of a fit.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct FitReport {
-    /// Sweeps with a pose.
+    /// Number of sweeps with a pose.
     pub sweeps: usize,
-    /// Of these, more than 3 m off.
+    /// Number of these with an error above 3 m.
     pub bad: usize,
-    /// Bad ones that are withheld.
+    /// Number of bad poses that are rejected.
     pub bad_withheld: usize,
-    /// Good ones that are withheld.
+    /// Number of good poses that are rejected.
     pub good_withheld: usize,
 }
 
-/// Why nothing can be fitted.
+/// Error of a fit.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum FitError {
     /// There are too few poses.
     #[error("a confidence is fitted on at least {MIN_SWEEPS} sweeps with a pose, there are {0}")]
     TooFew(usize),
-    /// No share that leaves a pose.
-    #[error("the share of good poses that may be withheld is {0}, must be 0 to less than 1")]
+    /// The share leaves no pose.
+    #[error("the share of good poses that may be rejected is {0}, must be 0 to less than 1")]
     GoodLoss(f64),
 }
 
-/// Checks the share of good poses that a fit may withhold.
+/// Checks the share of good poses that a fit may reject.
 ///
 /// # Errors
 /// [`FitError::GoodLoss`] unless it is at least 0 and below 1.
@@ -63,7 +63,7 @@ pub fn check_good_loss(good_loss: f64) -> Result<(), FitError> {
 }
 
 impl ConfidenceModel {
-    /// Fits weights, map and threshold; at most the share `good_loss` of good poses is withheld.
+    /// Fits weights, isotonic function and threshold; at most the share `good_loss` of good poses is rejected.
     ///
     /// # Errors
     /// [`FitError`] when there are too few sweeps, or `good_loss` is not at least 0 and below 1.
@@ -94,7 +94,7 @@ impl ConfidenceModel {
     }
 }
 
-/// What sigma should be for an error: Eq. 6 with the true error in place of the predicted one.
+/// Target sigma of an error: Eq. 6 with the true error in place of the predicted one.
 #[must_use]
 pub fn observed(error_m: f64) -> f64 {
     1.0 / (1.0 + error_m * error_m)
@@ -142,20 +142,20 @@ mod tests {
     use crate::pgc::synthetic::SyntheticScene;
     use crate::statistics::spearman;
 
-    /// Sweeps of a town in which some places are hard and a few hopeless.
+    /// Sweeps of a scene in which some places are hard and a few impossible to localize.
     fn sweeps(seeds: std::ops::Range<u64>) -> Vec<Labelled> {
         let sweep = |seed: u64| {
             let hardness = (seed % 97) as f64 / 97.0;
-            let town = SyntheticScene {
+            let scene = SyntheticScene {
                 outliers: 0.1 + 0.6 * hardness,
                 noise_m: 0.1 + 0.5 * hardness,
                 cells: 250,
                 ..SyntheticScene::default()
             };
             let is_hopeless = seed.is_multiple_of(10);
-            let town = if is_hopeless { SyntheticScene { outliers: 0.85, twins: 1.0, ..town } } else { town };
-            let found = PoseSolver::default().solve(&town.coordinates(seed)).ok()?;
-            let off = town.world_from_sensor(seed).inv_mul(&found.world_from_sensor);
+            let scene = if is_hopeless { SyntheticScene { outliers: 0.85, twins: 1.0, ..scene } } else { scene };
+            let found = PoseSolver::default().solve(&scene.coordinates(seed)).ok()?;
+            let off = scene.world_from_sensor(seed).inv_mul(&found.world_from_sensor);
             Some(Labelled { evidence: found.evidence, error_m: off.translation.vector.norm() })
         };
         seeds.filter_map(sweep).collect()
@@ -186,7 +186,7 @@ mod tests {
     }
 
     #[test]
-    fn no_share_that_leaves_no_pose_is_taken() {
+    fn a_share_that_leaves_no_pose_is_rejected() {
         for good_loss in [1.0, -0.1, 1.5] {
             assert_eq!(ConfidenceModel::fit(&[], good_loss), Err(FitError::GoodLoss(good_loss)));
         }

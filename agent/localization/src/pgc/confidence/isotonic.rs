@@ -1,27 +1,27 @@
-//! Falling functions from data: isotonic regression by pooling adjacent violators (Barlow et al. 1972).
+//! Decreasing functions from data: isotonic regression by pooling adjacent violators (Barlow et al. 1972).
 
 use serde::{Deserialize, Serialize};
 
-/// How far knots that are equal may be out of order for rounding, relative.
+/// Relative tolerance of the order of knots that are equal up to rounding.
 const ROUNDING: f64 = 1e-9;
 
-/// A falling function: straight between its knots, flattening out towards 0 and 1 beyond them.
+/// Decreasing function: linear between its knots, approaching 0 and 1 beyond them.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(transparent)]
 pub struct MonotoneMap {
-    /// x ascending and value; values in 0..=1, never rising.
+    /// x ascending and value; values in 0..=1, never increasing.
     knots: Vec<(f64, f64)>,
 }
 
 impl MonotoneMap {
-    /// From knots whose x ascend and whose values, 0..=1, fall or stay.
+    /// Function from knots with ascending x and non-increasing values, 0..=1.
     #[must_use]
     pub fn falling(knots: Vec<(f64, f64)>) -> Self {
         Self { knots }
     }
 
-    /// Fits a falling function to samples of x and value, in groups of neighbours: about `groups` of them, each of at
-    /// least `smallest` samples.
+    /// Fits a decreasing function to samples of x and value, in groups of neighbours: about `groups` of them, each of
+    /// at least `smallest` samples.
     #[must_use]
     pub fn fit(mut samples: Vec<(f64, f64)>, groups: usize, smallest: usize) -> Self {
         samples.sort_by(|a, b| a.0.total_cmp(&b.0));
@@ -49,10 +49,10 @@ impl MonotoneMap {
         Self { knots: pools.iter().map(|pool| (pool.x / pool.count, pool.mean())).collect() }
     }
 
-    /// Checks that knots rise in x and fall in value, as those that were fitted do but for rounding.
+    /// Checks that x increases and values decrease from knot to knot, as in a fit up to rounding.
     ///
     /// # Errors
-    /// Says which knots are wrong.
+    /// The knots that are wrong.
     pub(super) fn check(&self) -> Result<(), String> {
         if let Some((x, y)) = self.knots.iter().find(|(x, y)| !x.is_finite() || !(0.0..=1.0).contains(y)) {
             return Err(format!("sigma has a knot [{x}, {y}], its value must be 0 to 1"));
@@ -67,7 +67,7 @@ impl MonotoneMap {
         }
     }
 
-    /// The value at `x`; 0.5 for a map without knots, 0 where `x` is no number.
+    /// Value at `x`; 0.5 for a function without knots, 0 if `x` is NaN.
     #[must_use]
     pub fn at(&self, x: f64) -> f64 {
         if x.is_nan() {
@@ -117,7 +117,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn it_never_rises_and_stays_within_bounds(
+        fn it_never_increases_and_stays_within_bounds(
             samples in prop::collection::vec((-5.0..5.0_f64, 0.0..=1.0_f64), 0..80),
             a in -9.0..9.0_f64, b in -9.0..9.0_f64,
         ) {
@@ -137,14 +137,14 @@ mod tests {
     }
 
     #[test]
-    fn beyond_the_data_it_goes_on_falling() {
+    fn beyond_the_data_it_keeps_decreasing() {
         let map = MonotoneMap::falling(vec![(0.0, 0.8), (1.0, 0.1)]);
         assert!(map.at(-1.0) > 0.8 && map.at(-9.0) < 1.0 && map.at(2.0) < 0.1 && map.at(9.0) > 0.0);
         assert_eq!(MonotoneMap::fit(Vec::new(), 4, 1).at(3.0), 0.5);
     }
 
     #[test]
-    fn what_is_no_number_has_no_confidence() {
+    fn nan_has_no_confidence() {
         let map = MonotoneMap::falling(vec![(0.0, 0.8), (1.0, 0.1)]);
         assert_eq!((map.at(f64::NAN), map.at(f64::INFINITY), map.at(f64::NEG_INFINITY)), (0.0, 0.0, 1.0));
     }

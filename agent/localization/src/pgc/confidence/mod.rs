@@ -1,8 +1,8 @@
-//! How far to trust a pose: from what speaks for it to one number, sigma.
+//! Confidence of a pose: maps the evidence for the pose to one number, sigma.
 //!
-//! Sigma is calibrated when poses with sigma `s` have errors `e` with a mean of `1 / (1 + e^2)` of `s`, `e` in metres: what
-//! Eq. 6 of the paper says of a cell, said of a pose. Without calibration it is the mean of the inliers' confidences times
-//! their share.
+//! Sigma is calibrated if the poses with sigma `s` have errors `e` (metres) whose mean of `1 / (1 + e^2)` is `s`: Eq. 6
+//! of the paper, which defines sigma for a cell, applied to a pose. Without calibration it is the mean of the inliers'
+//! confidences times the inlier ratio.
 
 mod fit;
 mod isotonic;
@@ -17,19 +17,19 @@ use super::pose_evidence::{PoseEvidence, RefinementEvidence};
 /// Number of features of [`PoseEvidence`].
 const FEATURES: usize = 14;
 
-/// Metadata key of a head's file that the [`ConfidenceModel`] of its town lies under, as JSON.
+/// Metadata key of a head's file that holds the [`ConfidenceModel`] of its scene, as JSON.
 pub const CONFIDENCE_KEY: &str = "confidence";
 
-/// Beyond this no fit gets with its weights and bias, by far; sums of so many and such features are numbers.
+/// Bound of weights and bias, far beyond those of any fit; it keeps sums of weighted features finite.
 const MAX_WEIGHT: f64 = 1e9;
 
-/// How sigma is computed.
+/// Computation of sigma.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub enum Confidence {
-    /// Mean confidence of the inliers times their share; nothing is withheld.
+    /// Mean confidence of the inliers times the inlier ratio; nothing is rejected.
     #[default]
     Plain,
-    /// Fitted on sweeps whose poses are known.
+    /// Fitted on sweeps with known poses.
     Calibrated(ConfidenceModel),
 }
 
@@ -43,7 +43,7 @@ impl Confidence {
         }
     }
 
-    /// Whether a pose of this sigma is kept back.
+    /// True if a pose of this sigma is rejected.
     #[must_use]
     pub fn withholds(&self, sigma: f64) -> bool {
         match self {
@@ -53,26 +53,26 @@ impl Confidence {
     }
 }
 
-/// Sigma as a monotone map of a weighted sum of what speaks against a pose.
+/// Sigma as a monotone function of a weighted sum of the evidence against a pose.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ConfidenceModel {
     /// Expected logarithm of the error in metres where all features are 0.
     pub bias: f64,
-    /// Weight of each feature, none below 0: what speaks against a pose never helps it, however far a sweep lies from those
-    /// that were fitted on.
+    /// Weight of each feature, none below 0: evidence against a pose never increases sigma, however far a sweep is from
+    /// the fitted ones.
     pub weights: [f64; FEATURES],
-    /// From the expected logarithm of the error to sigma, falling.
+    /// Decreasing function from the expected logarithm of the error to sigma.
     pub sigma: MonotoneMap,
-    /// Poses of a lower sigma are kept back.
+    /// Threshold: poses of a lower sigma are rejected.
     pub withhold_below: f64,
 }
 
 impl ConfidenceModel {
-    /// Checks numbers that come from a file: that they are such as a fit has.
+    /// Checks values from a file against the bounds of a fit.
     ///
     /// # Errors
-    /// Says which field is wrong and what stood there.
+    /// Field and value that are wrong.
     pub fn check(&self) -> Result<(), String> {
         if self.bias.is_nan() || self.bias.abs() > MAX_WEIGHT {
             return Err(format!("bias is {:?}, must be -1e9 to 1e9", self.bias));
@@ -105,11 +105,11 @@ impl ConfidenceModel {
     }
 }
 
-/// What speaks against a pose, each the larger the worse: logarithms, because errors span orders of magnitude.
+/// Evidence against a pose, each feature the larger the worse: logarithms, because errors span orders of magnitude.
 fn features(evidence: &PoseEvidence) -> [f64; FEATURES] {
     let log = |value: f64| value.clamp(1e-3, 1e6).ln();
     // A head has a refiner or has none: features that are always 0 get no weight.
-    let again =
+    let refinement =
         |value: fn(&RefinementEvidence) -> f64| evidence.second.as_ref().map_or(0.0, |second| log(value(second)));
     [
         -log(evidence.inlier_ratio),
@@ -119,13 +119,13 @@ fn features(evidence: &PoseEvidence) -> [f64; FEATURES] {
         log(evidence.median_epsilon_m),
         log(evidence.position_std_m),
         log(evidence.rotation_std_rad),
-        -again(|second| second.inlier_ratio),
-        again(|second| second.rms_m),
-        again(|second| second.median_epsilon_m),
-        again(|second| second.moved_m),
-        again(|second| second.residual_quartile_m),
-        -again(|second| second.information_per_m2),
-        again(|second| second.worst_axis_std_m),
+        -refinement(|second| second.inlier_ratio),
+        refinement(|second| second.rms_m),
+        refinement(|second| second.median_epsilon_m),
+        refinement(|second| second.moved_m),
+        refinement(|second| second.residual_quartile_m),
+        -refinement(|second| second.information_per_m2),
+        refinement(|second| second.worst_axis_std_m),
     ]
 }
 
@@ -136,10 +136,10 @@ mod tests {
     use crate::pgc::synthetic::SyntheticScene;
 
     #[test]
-    fn sigma_falls_with_what_speaks_against_a_pose() {
+    fn sigma_decreases_with_evidence_against_a_pose() {
         let sigma = |outliers, noise_m| {
-            let town = SyntheticScene { outliers, noise_m, ..SyntheticScene::default() };
-            let found = PoseSolver::default().solve(&town.coordinates(1)).unwrap();
+            let scene = SyntheticScene { outliers, noise_m, ..SyntheticScene::default() };
+            let found = PoseSolver::default().solve(&scene.coordinates(1)).unwrap();
             ConfidenceModel::example().sigma(&found.evidence)
         };
         let falling = [sigma(0.1, 0.1), sigma(0.3, 0.2), sigma(0.6, 0.4), sigma(0.8, 0.6)];
@@ -155,7 +155,7 @@ mod tests {
     }
 
     #[test]
-    fn numbers_that_no_fit_has_are_refused_by_name() {
+    fn values_that_no_fit_has_are_rejected_by_name() {
         let example = ConfidenceModel::example;
         assert_eq!(example().check(), Ok(()));
         let refused = |model: ConfidenceModel, field: &str| model.check().unwrap_err().contains(field);
@@ -172,7 +172,7 @@ mod tests {
     }
 
     #[test]
-    fn the_plain_confidence_withholds_nothing() {
+    fn the_plain_confidence_rejects_nothing() {
         assert!(!Confidence::Plain.withholds(0.0));
         assert!(Confidence::Calibrated(ConfidenceModel::example()).withholds(0.09));
     }

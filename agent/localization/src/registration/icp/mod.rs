@@ -1,8 +1,8 @@
 //! Iterative closest point, point to plane (Chen and Medioni 1992), on voxels and from coarse to fine.
 //!
-//! The target becomes small planes, one per voxel; every step pairs the source's points with the nearest of them, weighs
-//! the pairs by how well they fit already (Geman and McClure 1987), and solves one Gauss-Newton step. There is no global
-//! search: what starts some metres off ends in a wrong place, and nothing tells. That is the method, not this code.
+//! The target becomes small planes, one per voxel; every step pairs the source's points with the nearest of them,
+//! weighs the pairs by their residuals (Geman and McClure 1987), and solves one Gauss-Newton step. There is no global
+//! search: a start some metres off ends in a wrong pose without an error. That is the method, not this code.
 //!
 //! Two uses: a neighbour's sweep against the ego's, and a sweep against a map of many sweeps ([`IcpTarget::add`]).
 
@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 
 use surfels::{Surfels, decimate};
 
-/// Turns and shifts are made comparable by the way a turn of one radian moves a typical point, metres.
+/// Distance that a rotation of one radian moves a typical point, metres: makes rotations and translations comparable.
 const LEVER_M: f64 = 10.0;
 /// A step smaller than this ends a level: metres and, times [`LEVER_M`], radians.
 const CONVERGED_M: f64 = 1e-3;
@@ -22,11 +22,11 @@ const CONVERGED_M: f64 = 1e-3;
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct IcpLevel {
-    /// Side of the target's voxels, metres. Points farther than one and a half of it from any plane find none.
+    /// Side of the target's voxels, metres. Points farther than one and a half of it from any plane have no partner.
     pub voxel_m: f64,
-    /// Distance to the plane at which a pair counts a quarter, metres.
+    /// Distance to the plane at which a pair has a quarter of its weight, metres.
     pub scale_m: f64,
-    /// Most steps.
+    /// Largest number of steps.
     pub max_steps: u32,
 }
 
@@ -36,16 +36,16 @@ pub struct IcpLevel {
 pub struct IcpConfig {
     /// From coarse to fine.
     pub levels: Vec<IcpLevel>,
-    /// Nearest and farthest points that take part, metres: nearer ones are hits on the vehicle itself.
+    /// Smallest and largest range of points that are used, metres: nearer ones are hits on the vehicle itself.
     pub range_m: [f64; 2],
-    /// The source is decimate to one point per voxel of this side, metres.
+    /// Side of the voxels that the source is decimated with, one point per voxel, metres.
     pub source_voxel_m: f64,
-    /// And at each level to about this many points.
+    /// Approximate number of points of the source at each level.
     pub max_points: usize,
-    /// Share of the source's points that must have a partner in the end. Vehicles 50 m apart share a tenth of what
-    /// they see.
+    /// Share of the source's points that must have a partner in the end. Vehicles 50 m apart share a tenth of what they
+    /// measure.
     pub min_overlap: f64,
-    /// How well the worst direction must be fixed: 1 where every pair fixes it, 0 where none does.
+    /// Required constraint of the worst direction: 1 if every pair constrains it, 0 if none does.
     pub min_constraint: f64,
 }
 
@@ -64,25 +64,25 @@ impl Default for IcpConfig {
     }
 }
 
-/// What is registered against: one sweep, or a map of many.
+/// Target of a registration: one sweep, or a map of many.
 #[derive(Debug, Clone)]
 pub struct IcpTarget {
     /// Relative to `origin_m`.
     levels: Vec<Surfels>,
-    /// Where the first sweep was taken: keeps numbers small far out in the world.
+    /// Position of the first sweep: keeps numbers small far out in the world.
     origin_m: Option<Vector3<f64>>,
     range_m: [f64; 2],
 }
 
 impl IcpTarget {
-    /// A target without a point.
+    /// Target without a point.
     #[must_use]
     pub fn new(config: &IcpConfig) -> Self {
         let levels = config.levels.iter().map(|level| Surfels::new(level.voxel_m)).collect();
         Self { levels, origin_m: None, range_m: config.range_m }
     }
 
-    /// A target of one sweep, in the frame of its sensor.
+    /// Target of one sweep, in the frame of its sensor.
     #[must_use]
     pub fn of_sweep(xyzi: &[[f32; 4]], config: &IcpConfig) -> Self {
         let mut target = Self::new(config);
@@ -114,33 +114,33 @@ impl IcpTarget {
     }
 }
 
-/// A sweep laid out for registering it, and what a vehicle would have to send of it.
+/// A sweep prepared for registration, and the data that a vehicle would have to send of it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct IcpSource {
     points_m: Vec<Vector3<f64>>,
 }
 
 impl IcpSource {
-    /// Thins a sweep.
+    /// Decimates a sweep.
     #[must_use]
     pub fn of_sweep(xyzi: &[[f32; 4]], config: &IcpConfig) -> Self {
         Self { points_m: decimate(within(xyzi, config.range_m), config.source_voxel_m) }
     }
 
-    /// The points that are left, in the frame of the sensor, metres.
+    /// The points that are left `[N]`, in the frame of the sensor, metres.
     #[must_use]
     pub fn points_m(&self) -> &[Vector3<f64>] {
         &self.points_m
     }
 }
 
-/// Points that take part.
+/// Points in range.
 fn within(xyzi: &[[f32; 4]], [nearest_m, farthest_m]: [f64; 2]) -> impl Iterator<Item = Vector3<f64>> {
     let points = xyzi.iter().map(|[x, y, z, _]| Vector3::new(*x, *y, *z).cast());
     points.filter(move |point: &Vector3<f64>| (nearest_m..=farthest_m).contains(&point.norm()))
 }
 
-/// Where a sweep came to lie.
+/// Pose of a registered sweep.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct IcpFit {
     /// Takes points of the source's sensor to the target frame.
@@ -153,33 +153,33 @@ pub struct IcpFit {
     pub steps: u32,
 }
 
-/// Why a sweep came to lie nowhere.
+/// Reason why a sweep cannot be registered.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 pub enum NoIcpFit {
     /// Source or target are (nearly) empty.
     #[error("{found} {what}, at least {required} are needed")]
     TooFew {
-        /// Source points or target planes.
+        /// Kind: source points or target planes.
         what: &'static str,
-        /// How many there are.
+        /// Number found.
         found: usize,
-        /// What it takes.
+        /// Number required.
         required: usize,
     },
-    /// The clouds do not overlap where they came to lie.
+    /// The clouds do not overlap at the resulting pose.
     #[error("{overlap:.2} of the points have a partner, at least {required:.2} must")]
     TooLittleOverlap {
         /// Share of points with a partner.
         overlap: f64,
-        /// What it takes.
+        /// Required share.
         required: f64,
     },
-    /// Some direction is free: nothing but ground, or a street between two walls.
-    #[error("the planes fix the worst direction to {constraint:.1e} only, at least {required:.1e} is needed")]
+    /// Some direction is unconstrained: nothing but ground, or a street between two walls.
+    #[error("the planes constrain the worst direction to {constraint:.1e} only, at least {required:.1e} is needed")]
     Unconstrained {
-        /// How well the worst direction is fixed, 0..1.
+        /// Constraint of the worst direction, 0..1.
         constraint: f64,
-        /// What it takes.
+        /// Required constraint.
         required: f64,
     },
 }
@@ -187,11 +187,11 @@ pub enum NoIcpFit {
 /// Fewest source points and target planes.
 const MIN_POINTS: usize = 50;
 
-/// Registers a sweep, beginning at `start`.
+/// Registers a sweep, starting at `start`.
 ///
 /// # Errors
-/// [`NoIcpFit`] where there is too little to register, or the result is not fixed by it. A result is no proof: a wrong
-/// start gives a wrong one.
+/// [`NoIcpFit`] if there is too little to register, or the result is not constrained by it. A result is no proof: a
+/// wrong start gives a wrong one.
 pub fn register(
     source: &IcpSource,
     target: &IcpTarget,
@@ -224,7 +224,7 @@ pub fn register(
     Ok(IcpFit { target_from_source: origin * motion, overlap, rms_m: (last.squares / last.pairs).sqrt(), steps })
 }
 
-/// `motion`, turned about the sensor and shifted: the step's turn is in units of 1 / [`LEVER_M`] radians.
+/// `motion`, rotated about the sensor and translated: the step's rotation is in units of 1 / [`LEVER_M`] radians.
 fn moved(motion: &Isometry3<f64>, step: &Vector6<f64>) -> Isometry3<f64> {
     let turn = Vector3::new(step[0], step[1], step[2]) / LEVER_M;
     let shift = Vector3::new(step[3], step[4], step[5]);
@@ -234,7 +234,7 @@ fn moved(motion: &Isometry3<f64>, step: &Vector6<f64>) -> Isometry3<f64> {
     )
 }
 
-/// Sums of one Gauss-Newton step: turn about the sensor times [`LEVER_M`], then shift, all in metres.
+/// Sums of one Gauss-Newton step: rotation about the sensor times [`LEVER_M`], then translation, all in metres.
 #[derive(Debug, Clone, Copy, Default)]
 struct NormalEquations {
     hessian: Matrix6<f64>,
@@ -272,7 +272,7 @@ impl NormalEquations {
         sums
     }
 
-    /// The step, `None` without any pair. Directions that nothing fixes are left alone.
+    /// The step, `None` without any pair. Unconstrained directions are not changed.
     fn step(&self) -> Option<Vector6<f64>> {
         let damped = self.hessian + Matrix6::identity() * (1e-6 * self.weight);
         let step = damped.cholesky()?.solve(&-self.gradient);
@@ -296,7 +296,8 @@ impl NormalEquations {
 mod tests {
     use super::*;
 
-    /// A crossing of two streets as a LiDAR at 2 m sees it from `world_from_sensor`: ground, eight walls, posts.
+    /// Sweep of a LiDAR at a height of 2 m at `world_from_sensor` in a crossing of two streets: ground, eight walls,
+    /// posts.
     fn crossing(world_from_sensor: &Isometry3<f64>, shift: f64) -> Vec<[f32; 4]> {
         let mut world = Vec::new();
         let mut add = |x: f64, y: f64, z: f64| world.push(Vector3::new(x, y, z));
@@ -368,7 +369,7 @@ mod tests {
     }
 
     #[test]
-    fn traffic_that_has_moved_is_not_believed() {
+    fn traffic_that_has_moved_is_an_outlier() {
         let config = IcpConfig::default();
         let (here, there) = (pose(0.0, 0.0, 0.0), pose(1.0, 0.3, 0.02));
         let mut moved = crossing(&there, 0.1);
@@ -386,7 +387,7 @@ mod tests {
     }
 
     #[test]
-    fn bare_ground_and_a_tunnel_leave_directions_free() {
+    fn bare_ground_and_a_tunnel_leave_directions_unconstrained() {
         let config = IcpConfig::default();
         let ground = |shift: f32| -> Vec<[f32; 4]> {
             (0..10_000)
@@ -410,7 +411,7 @@ mod tests {
     }
 
     #[test]
-    fn thin_evidence_is_said() {
+    fn too_little_evidence_is_an_error() {
         let config = IcpConfig::default();
         let sweep = crossing(&pose(0.0, 0.0, 0.0), 0.0);
         let (source, target) = (IcpSource::of_sweep(&sweep, &config), IcpTarget::of_sweep(&sweep, &config));

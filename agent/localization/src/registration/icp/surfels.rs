@@ -1,6 +1,6 @@
-//! A point cloud as small planes: one per voxel, where the points in and around it are flat.
+//! Surfels: a point cloud as small planes, one per voxel whose points and those around it are flat.
 //!
-//! Coordinates are to be near zero, some kilometres, or sums of squares lose what planes are made of.
+//! Coordinates have to be near zero, some kilometres, or sums of squares lose the precision that planes need.
 
 use nalgebra::{Matrix3, SymmetricEigen, Vector3};
 
@@ -8,10 +8,10 @@ use perception::sparse::Sites;
 
 /// Fewest points that a plane is fitted to.
 const MIN_POINTS: f64 = 6.0;
-/// A plane is at most this thick: its smallest variance as a share of the middle one.
+/// Largest thickness of a plane: its smallest variance as a share of the middle one.
 const MAX_THICKNESS: f64 = 0.08;
-/// And at least this wide: its middle variance as a share of the largest. Below it the points lie on one scan line, and
-/// any plane through that line fits.
+/// Smallest width of a plane: its middle variance as a share of the largest. Below it the points lie on one scan line,
+/// and any plane through that line fits.
 const MIN_WIDTH: f64 = 0.02;
 
 /// A small plane.
@@ -49,7 +49,7 @@ impl Moments {
         self.sum / self.count
     }
 
-    /// The normal of the plane that the points lie in, if they lie in one.
+    /// Normal of the plane through the points, if they are flat.
     fn normal(&self) -> Option<Vector3<f64>> {
         if self.count < MIN_POINTS {
             return None;
@@ -64,7 +64,7 @@ impl Moments {
     }
 }
 
-/// A cloud, or many clouds in one frame, as planes on a lattice of voxels.
+/// A cloud, or many clouds in one frame, as planes on a voxel grid.
 #[derive(Debug, Clone)]
 pub(super) struct Surfels {
     voxel_m: f64,
@@ -89,8 +89,8 @@ impl Surfels {
         self.moments[row].add(point_m);
     }
 
-    /// Fits the planes: each to the points of its voxel and of the 26 around it, since one sweep leaves a line or two in
-    /// a voxel.
+    /// Fits the planes: each to the points of its voxel and of the 26 around it, since one sweep leaves a line or two
+    /// in a voxel.
     pub(super) fn fit(&mut self) {
         let around = |coord: &[i32; 3]| {
             let mut moments = Moments::default();
@@ -108,13 +108,13 @@ impl Surfels {
         self.planes = self.sites.coords().iter().zip(&self.moments).map(plane).collect();
     }
 
-    /// Voxels that are planes.
+    /// Number of voxels with a plane.
     pub(super) fn len(&self) -> usize {
         self.planes.iter().flatten().count()
     }
 
-    /// The plane whose centre is nearest to a point, of the eight voxels on the point's side: complete to half a voxel,
-    /// good enough to one and a half.
+    /// The plane whose centre is nearest to a point, among the eight voxels on the point's side: complete to half a
+    /// voxel, approximate to one and a half.
     pub(super) fn near(&self, point_m: &Vector3<f64>) -> Option<Surfel> {
         let first = voxel_of(&point_m.add_scalar(-self.voxel_m / 2.0), self.voxel_m)?;
         let mut nearest = None;
@@ -149,10 +149,10 @@ pub(super) fn decimate(points_m: impl IntoIterator<Item = Vector3<f64>>, voxel_m
     sums.into_iter().map(|(sum, count)| sum / count).collect()
 }
 
-/// The voxel a point lies in; `None` where there is none.
+/// Voxel of a point; `None` if no voxel can hold it.
 fn voxel_of(point_m: &Vector3<f64>, voxel_m: f64) -> Option<[i32; 3]> {
     let voxel = (point_m / voxel_m).map(f64::floor);
-    // One voxel of margin, since neighbours are looked up. Also refuses what is not finite.
+    // One voxel of margin for the neighbours that are looked up. Also rejects values that are not finite.
     let held = voxel.iter().all(|axis| axis.abs() < f64::from((1 << 20) - 2));
     held.then(|| [voxel.x as i32, voxel.y as i32, voxel.z as i32])
 }
@@ -196,7 +196,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_place_is_left_out() {
+    fn points_that_are_not_finite_are_left_out() {
         let mut surfels = Surfels::new(0.5);
         surfels.add(&Vector3::new(f64::NAN, 0.0, 0.0));
         surfels.add(&Vector3::new(0.0, f64::INFINITY, 0.0));

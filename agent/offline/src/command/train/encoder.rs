@@ -1,4 +1,4 @@
-//! `agent train encoder`.
+//! `agent train encoder`: arguments, progress and model card.
 
 use std::path::PathBuf;
 
@@ -6,23 +6,23 @@ use agent_offline::training::{EncoderAccuracy, EncoderReport, EncoderSummary, En
 use localization::pgc::SceneEncoderConfig;
 use perception::train::{ModelCard, TrainingBar, TrainingOptions};
 
-use super::options::{bad, check_folders, run_config, say_left_out};
+use super::options::{bad, check_folders, print_left_out, run_config};
 
 /// Train a scene encoder on sweeps that overlap; writes checkpoint, curve.csv, weights.safetensors and model-card.md.
 ///
-/// Nothing of a town stays in it: a head for any town is trained on its features afterwards.
+/// The encoder is independent of the scene: a head for any scene is trained on its features afterwards.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Folders of scenes, one town each; drives through the same town belong into one folder.
+    /// Folders of sweeps, one scene each; drives through the same scene belong into one folder.
     #[arg(long, required = true, num_args = 1.., value_name = "DIR")]
     scenes: Vec<PathBuf>,
-    /// Folders of scenes to validate on, one town each.
+    /// Folders of sweeps to validate on, one scene each.
     #[arg(long, num_args = 1.., value_name = "DIR")]
     validation: Vec<PathBuf>,
     /// Network.
     #[arg(long, default_value = "lean", value_parser = parse_config)]
     config: SceneEncoderConfig,
-    /// Pairs of sweeps of a step.
+    /// Pairs of sweeps per step.
     #[arg(long, default_value_t = 4)]
     batch: usize,
     /// Highest learning rate.
@@ -36,7 +36,7 @@ pub(crate) struct Args {
 }
 
 fn parse_config(name: &str) -> Result<SceneEncoderConfig, String> {
-    SceneEncoderConfig::preset(name).ok_or_else(|| "there are lean and full".to_owned())
+    SceneEncoderConfig::preset(name).ok_or_else(|| "must be lean or full".to_owned())
 }
 
 pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
@@ -51,7 +51,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
 
 fn tell(bar: &TrainingBar, report: &EncoderReport) {
     match report {
-        EncoderReport::Read(data) => say_left_out(bar, data),
+        EncoderReport::Read(data) => print_left_out(bar, data),
         EncoderReport::Stepped { step, share_done, seconds, loss, accuracy } => {
             let EncoderAccuracy { top1, offset_m } = accuracy;
             let text = format!("step {step} loss {loss:.3} top-1 {:.1} % offset {offset_m:.2} m", 100.0 * top1);
@@ -66,7 +66,7 @@ fn tell(bar: &TrainingBar, report: &EncoderReport) {
 impl Args {
     fn config(&self) -> anyhow::Result<EncoderTrainConfig> {
         if self.validate_every == 0 {
-            return Err(bad("--validate-every is above zero"));
+            return Err(bad("--validate-every must be above zero"));
         }
         check_folders(self.scenes.iter().chain(&self.validation))?;
         Ok(EncoderTrainConfig {
@@ -87,13 +87,13 @@ fn card(config: &EncoderTrainConfig, summary: &EncoderSummary) -> ModelCard {
             config.encoder.voxel_m
         ),
     );
-    let data = format!("{} sweeps of {} towns", summary.sweeps, config.scenes.len());
+    let data = format!("{} sweeps of {} scenes", summary.sweeps, config.scenes.len());
     card.trained(&config.run, &summary.trained, &data, "pairs");
     if let Some(accuracy) = summary.accuracy {
         card.row(
             "validation",
             format_args!(
-                "{:.1} % of cells find their match among those of two pairs, offset known to {:.2} m (L1)",
+                "{:.1} % of cells find their match among those of two pairs, offset error {:.2} m (L1)",
                 100.0 * accuracy.top1,
                 accuracy.offset_m
             ),

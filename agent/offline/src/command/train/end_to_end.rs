@@ -1,4 +1,4 @@
-//! `agent train end-to-end`.
+//! `agent train end-to-end`: arguments, progress and model card.
 
 use std::path::PathBuf;
 
@@ -7,24 +7,24 @@ use localization::competitors::EndToEndKind;
 use localization::pgc::SceneEncoderConfig;
 use perception::train::{ModelCard, TrainingBar, TrainingOptions};
 
-use super::options::{check_folders, run_config, say_left_out};
+use super::options::{check_folders, print_left_out, run_config};
 
-/// Train a competitor of the localizer on one town; writes checkpoint, weights.safetensors and model-card.md.
+/// Train a competitor of the localizer on one scene; writes checkpoint, weights.safetensors and model-card.md.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Folders of scenes, all of the same town.
+    /// Folders of sweeps, all of the same scene.
     #[arg(long, required = true, num_args = 1.., value_name = "DIR")]
     scenes: Vec<PathBuf>,
-    /// What is regressed: scene-coordinates stands for SGLoc, pose for HypLiLoc and DiffLoc.
+    /// Target of the regression: scene-coordinates stands for SGLoc, pose for HypLiLoc and DiffLoc.
     #[arg(long, value_enum)]
     regresses: Regresses,
-    /// Name of the town, for messages and the model card.
+    /// Name of the scene, for messages and the model card.
     #[arg(long, default_value = "town")]
     town: String,
-    /// Weights of an encoder that stays as it is [default: the encoder is trained with the rest, from nothing].
+    /// Weights of a frozen encoder [default: the encoder is trained from random weights with the rest].
     #[arg(long, value_name = "FILE")]
     encoder: Option<PathBuf>,
-    /// Sweeps of a step; with --encoder, 400 cells for each.
+    /// Sweeps per step; with --encoder, 400 cells for each.
     #[arg(long, default_value_t = 6)]
     batch: usize,
     /// Highest learning rate.
@@ -65,11 +65,11 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         }
     })?;
     bar.finish();
-    say_left_out(&bar, &trained.data);
+    print_left_out(&bar, &trained.data);
     let title = format!("End-to-end regressor of {}: {:?}", config.town, config.regresses);
     let how = match args.encoder {
-        Some(_) => "Last layers on the features of a frozen encoder, trained on the sweeps of one town.",
-        None => "Trained from nothing on the sweeps of one town.",
+        Some(_) => "Last layers on the features of a frozen encoder, trained on the sweeps of one scene.",
+        None => "Trained from random weights on the sweeps of one scene.",
     };
     let mut card = ModelCard::new(&title, how);
     card.trained(&config.run, &trained, "all sweeps", "sweeps");

@@ -9,7 +9,7 @@ use anyhow::Context;
 use bus::malloc_settings;
 use clap::Subcommand;
 
-/// Train a localizer: an encoder once, over many towns; then a head for each town.
+/// Train a localizer: an encoder once, over many scenes; then a head for each scene.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
     #[command(subcommand)]
@@ -23,9 +23,9 @@ enum Stage {
     EndToEnd(end_to_end::Args),
 }
 
-/// Trains what was asked for.
+/// Runs the chosen stage.
 pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
-    malloc_settings::ensure(&malloc_settings::FEW_PRODUCTS).context("this program again")?;
+    malloc_settings::ensure(&malloc_settings::FEW_PRODUCTS).context("cannot execute this program again")?;
     match &args.stage {
         Stage::Encoder(args) => encoder::run(args),
         Stage::Scene(args) => scene::run(args),

@@ -1,4 +1,4 @@
-//! What the trainings of a localizer ask of the command line alike.
+//! Options that all trainings of a localizer share.
 
 use std::path::PathBuf;
 
@@ -7,17 +7,17 @@ use perception::train::{DataListing, RunConfig, TrainingBar, TrainingOptions};
 
 use support::cli::BadInput;
 
-/// An error for which the exit code is 2.
+/// Error with exit code 2.
 pub(crate) fn bad(reason: &str) -> anyhow::Error {
     BadInput::new(reason.to_owned()).into()
 }
 
-/// What a training is told; a fault of the options is one of usage.
+/// Configuration of a training; an invalid option is a usage error.
 pub(crate) fn run_config(options: &TrainingOptions, batch: usize, learning_rate: f64) -> anyhow::Result<RunConfig> {
     Ok(options.run_config(batch, learning_rate).map_err(BadInput::of)?)
 }
 
-/// Refuses folders that are not there before anything is computed.
+/// Rejects missing folders before anything is computed.
 pub(crate) fn check_folders<'a>(folders: impl IntoIterator<Item = &'a PathBuf>) -> anyhow::Result<()> {
     for folder in folders {
         std::fs::read_dir(folder).with_context(|| folder.display().to_string()).map_err(BadInput::of)?;
@@ -25,7 +25,7 @@ pub(crate) fn check_folders<'a>(folders: impl IntoIterator<Item = &'a PathBuf>) 
     Ok(())
 }
 
-/// Says what of the data is of no use.
-pub(crate) fn say_left_out(bar: &TrainingBar, data: &DataListing) {
+/// Prints the part of the data that cannot be used.
+pub(crate) fn print_left_out(bar: &TrainingBar, data: &DataListing) {
     data.left_out().iter().for_each(|text| bar.say(text));
 }

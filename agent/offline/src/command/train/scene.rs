@@ -1,4 +1,4 @@
-//! `agent train scene`.
+//! `agent train scene`: arguments, progress and model card.
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -8,19 +8,19 @@ use agent_offline::training::{
 };
 use perception::train::{ModelCard, TrainingBar, TrainingOptions};
 
-use super::options::{bad, check_folders, run_config, say_left_out};
+use super::options::{bad, check_folders, print_left_out, run_config};
 
-/// Train the head of one town on the features of a frozen encoder; writes checkpoint, curve.csv, weights.safetensors and
-/// model-card.md.
+/// Train the head of one scene on the features of a frozen encoder; writes checkpoint, curve.csv, weights.safetensors
+/// and model-card.md.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Folders of scenes, all of the same town.
+    /// Folders of sweeps, all of the same scene.
     #[arg(long, required = true, num_args = 1.., value_name = "DIR")]
     scenes: Vec<PathBuf>,
-    /// Folders of other scenes of the town to validate on.
+    /// Folders of other sweeps of the scene to validate on.
     #[arg(long, num_args = 1.., value_name = "DIR")]
     validation: Vec<PathBuf>,
-    /// Sweeps of a validation.
+    /// Number of sweeps of a validation.
     #[arg(long, default_value_t = 120)]
     validation_sweeps: usize,
     /// Seconds between two validations and checkpoints.
@@ -29,13 +29,13 @@ pub(crate) struct Args {
     /// Weights of the encoder.
     #[arg(long, value_name = "FILE")]
     encoder: PathBuf,
-    /// Name of the town, for messages and the model card.
+    /// Name of the scene, for messages and the model card.
     #[arg(long, default_value = "town")]
     town: String,
     /// Clusters of sensor positions that a sweep is classified into.
     #[arg(long, default_value_t = 50)]
     classes: i64,
-    /// Clusters of world coordinates that a cell is placed among.
+    /// Clusters of world coordinates, the reference points of a cell's offset.
     #[arg(long, default_value_t = 500)]
     centres: i64,
     /// Channels of the head.
@@ -44,19 +44,19 @@ pub(crate) struct Args {
     /// Residual blocks of three layers.
     #[arg(long, default_value_t = 3)]
     blocks: usize,
-    /// Leave the second look out.
+    /// Train no refinement network.
     #[arg(long)]
     no_refiner: bool,
-    /// Copies of every sweep, all but the first turned and decimate out at random.
+    /// Copies of every sweep, all but the first rotated and subsampled at random.
     #[arg(long, default_value_t = 1)]
     copies: usize,
-    /// Largest turn of such copies, degrees.
+    /// Largest rotation of such copies, degrees.
     #[arg(long, default_value_t = 10.0)]
     turn: f64,
-    /// Leave out sweeps that are learnt evenly (RSD); trainings of fewer than some 14 passes have no time to judge that.
+    /// Leave out sweeps with an even loss (RSD); trainings of fewer than some 14 passes are too short for it.
     #[arg(long)]
     rsd: bool,
-    /// Cells of a step.
+    /// Cells per step.
     #[arg(long, default_value_t = 4096)]
     batch: usize,
     /// Highest learning rate.
@@ -82,9 +82,9 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
 fn tell(bar: &TrainingBar, report: &SceneReport) {
     match report {
         SceneReport::Encoding(done, total) => bar.encoded(*done, *total),
-        SceneReport::Encoded(data) => say_left_out(bar, data),
+        SceneReport::Encoded(data) => print_left_out(bar, data),
         SceneReport::Classified(share) => {
-            bar.say(&format!("{:.1} % of the training sweeps are put into their cluster", 100.0 * share));
+            bar.say(&format!("{:.1} % of the training sweeps are assigned to their cluster", 100.0 * share));
         }
         SceneReport::Stepped { step, epoch, share_done, seconds, error_m, epsilon_m, refined_m } => {
             let text = format!(
@@ -106,7 +106,7 @@ fn tell(bar: &TrainingBar, report: &SceneReport) {
 impl Args {
     fn config(&self) -> anyhow::Result<SceneTrainConfig> {
         if self.copies == 0 || self.validation_sweeps == 0 {
-            return Err(bad("--copies and --validation-sweeps are above zero"));
+            return Err(bad("--copies and --validation-sweeps must be above zero"));
         }
         check_folders(self.scenes.iter().chain(&self.validation))?;
         Ok(SceneTrainConfig {

@@ -1,4 +1,4 @@
-//! Examples for last layers alone: cached features of a frozen encoder.
+//! Cached features of a frozen encoder, the examples of a training of last layers alone.
 
 use std::sync::Arc;
 
@@ -14,7 +14,7 @@ use localization::competitors::{EndToEnd, EndToEndKind};
 use localization::pgc::SceneEncoder;
 use perception::train::RunConfig;
 
-/// Cells that statistics are computed from.
+/// Number of cells that statistics are computed from.
 const SAMPLE: usize = 20_000;
 
 /// Rows of a cache, drawn at random.
@@ -40,7 +40,7 @@ impl Features {
         Ok(Self { cache, truth, run: run.clone(), step: 0 })
     }
 
-    /// Rows of `0..count`, the same for the same step.
+    /// Random rows of `0..count`, the same for the same step.
     fn draw(&self, count: usize, wanted: usize) -> Result<Tensor, tch::TchError> {
         let mut rng = ChaCha8Rng::seed_from_u64(self.run.seed);
         rng.set_stream(self.step);

@@ -1,15 +1,15 @@
-//! What competitors are trained by: absolute differences, as SGLoc and the regressors of poses have them.
+//! Losses of the competitors: absolute differences, as in SGLoc and the pose regressors.
 
 use nalgebra::{Isometry3, Vector3};
 use tch::{Device, Kind, TchError, Tensor};
 
 use localization::competitors::EndToEnd;
 
-/// Metres that a unit of heading (about 57 degrees) weighs as much as.
+/// Weight of a unit of heading (about 57 degrees), metres.
 const HEADING_WEIGHT_M: f64 = 30.0;
 
-/// Of regressed places: features `[N, cell_channels]` against `[N, 3]` relative to the network's origin, metres. Also the
-/// mean L1 error in metres.
+/// Loss of regressed coordinates: features `[N, cell_channels]` against `[N, 3]` relative to the network's origin,
+/// metres. Also the mean L1 error in metres.
 pub(super) fn coordinate_loss(
     network: &EndToEnd,
     cells: &Tensor,
@@ -20,7 +20,8 @@ pub(super) fn coordinate_loss(
     Ok((error, metres))
 }
 
-/// Of regressed poses: features `[S, sweep_channels]` against true poses. Also the mean L1 error of the position in metres.
+/// Loss of regressed poses: features `[S, sweep_channels]` against true poses. Also the mean L1 error of the position
+/// in metres.
 pub(super) fn pose_loss(network: &EndToEnd, sweeps: &Tensor, truth: &Truth) -> Result<(Tensor, f64), TchError> {
     let (position, heading) = network.poses(sweeps)?;
     let error = mean_l1(&position, &truth.positions_m)?;
@@ -29,7 +30,7 @@ pub(super) fn pose_loss(network: &EndToEnd, sweeps: &Tensor, truth: &Truth) -> R
     Ok((error + turn * HEADING_WEIGHT_M, metres))
 }
 
-/// True poses as the loss wants them.
+/// True poses as tensors of the loss.
 pub(super) struct Truth {
     /// `[S, 3]` relative to an origin, metres.
     positions_m: Tensor,
@@ -38,7 +39,7 @@ pub(super) struct Truth {
 }
 
 impl Truth {
-    /// Of sensors in the world.
+    /// Poses of sensors in the world.
     pub(super) fn new<'a>(
         world_from_sensor: impl Iterator<Item = &'a Isometry3<f64>>,
         origin_m: [f64; 3],

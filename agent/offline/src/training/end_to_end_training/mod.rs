@@ -1,5 +1,5 @@
-//! Training of the competitors on the sweeps of one town: the whole network from nothing, or its last layers on features of
-//! an encoder that knows correspondences already.
+//! Training of the competitors on the sweeps of one scene: the whole network from random weights, or its last layers on
+//! the features of a frozen encoder.
 
 mod features;
 mod loss;
@@ -29,40 +29,40 @@ const REPORT_EVERY: u64 = 10;
 /// Steps between two checkpoints.
 const CHECKPOINT_EVERY: u64 = 500;
 
-/// What to train, on what, for how long.
+/// Configuration of a training of a competitor.
 #[derive(Debug, Clone)]
 pub struct EndToEndTrainConfig {
-    /// Folders of scenes, all of one town.
+    /// Folders of sweeps, all of one scene.
     pub scenes: Vec<PathBuf>,
-    /// What is regressed.
+    /// Target of the regression.
     pub regresses: EndToEndKind,
-    /// Name of the town.
+    /// Name of the scene.
     pub town: String,
-    /// The encoder.
+    /// Origin of the encoder's weights.
     pub encoder: EncoderStart,
-    /// How; a batch are sweeps.
+    /// Training run; a batch are sweeps.
     pub run: RunConfig,
 }
 
-/// What becomes of the encoder.
+/// Origin of the encoder's weights.
 #[derive(Debug, Clone)]
 pub enum EncoderStart {
-    /// It is trained from nothing with the rest.
+    /// Random weights, trained with the rest.
     Untrained(SceneEncoderConfig),
-    /// It is read from this file and stays as it is.
+    /// Weights from this file, frozen.
     Frozen(PathBuf),
 }
 
-/// Where a training of a competitor is.
+/// Progress of a training of a competitor.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum EndToEndReport {
-    /// Sweeps are being encoded: how many of how many are done.
+    /// Sweeps are being encoded: number done and number of all.
     Encoding(usize, usize),
     /// Some steps are done.
     Stepped {
-        /// Steps done.
+        /// Number of steps done.
         step: u64,
-        /// Share that is done, 0..1.
+        /// Share of the training that is done, 0..1.
         share_done: f64,
         /// Seconds spent.
         seconds: f64,
@@ -71,15 +71,15 @@ pub enum EndToEndReport {
     },
 }
 
-/// Where the examples of the steps come from.
+/// Source of the examples of the steps.
 trait Examples {
-    /// Middle of the positions, metres in the world.
+    /// Centre of the positions, metres in the world.
     fn origin_m(&self) -> [f64; 3];
 
-    /// What features look like, `[N, channels]`, where that is known before a step is done.
+    /// Sample of the features, `[N, channels]`, if it is known before the first step.
     fn features(&self, regresses: EndToEndKind) -> Result<Option<Tensor>, LocalizerTrainError>;
 
-    /// Begins with the batch of a step.
+    /// Starts with the batch of a step.
     fn begin(&mut self, step: u64);
 
     /// Loss of the next batch, and its mean L1 error in metres.
@@ -149,7 +149,7 @@ pub fn train_end_to_end(
     Ok(trainer.save_weights(&variables, about, list.data())?)
 }
 
-/// Gives the encoder below `variables` the weights of a file, and keeps it from learning.
+/// Gives the encoder below `variables` the weights of a file and freezes it.
 fn adopt_encoder(variables: &VarStore, path: &Path, config: &SceneEncoderConfig) -> Result<(), LocalizerTrainError> {
     let stored = VarStore::new(variables.device());
     SceneEncoder::new(&stored.root(), config)?;

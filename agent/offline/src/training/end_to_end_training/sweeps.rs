@@ -1,4 +1,4 @@
-//! Examples for a network that is trained as a whole: sweeps, turned and decimate out at random.
+//! Sweeps, rotated and subsampled at random, the examples of a training of a whole network.
 
 use std::f64::consts::PI;
 use std::sync::Arc;
@@ -17,7 +17,7 @@ use localization::competitors::{EndToEnd, EndToEndKind};
 use localization::pgc::{SceneEncoderConfig, SweepVoxels, VoxelBatch};
 use perception::train::{Prefetch, RunConfig};
 
-/// Largest turn of a sweep, radians.
+/// Largest rotation of a sweep, radians.
 const TURN_RAD: f64 = 10.0 * PI / 180.0;
 
 type Batches = Prefetch<Result<Vec<TurnedSweep>, LocalizerTrainError>>;
@@ -32,7 +32,7 @@ pub(super) struct Sweeps {
 }
 
 impl Sweeps {
-    /// Looks through `list` for where its middle is.
+    /// Batches of `list`; computes the centre of its positions.
     pub(super) fn new(
         list: &Arc<SweepList>,
         encoder: &SceneEncoderConfig,
@@ -84,7 +84,7 @@ impl Examples for Sweeps {
     }
 }
 
-/// Middle of the positions; reads a tenth of them.
+/// Centre of the positions; reads a tenth of them.
 fn middle(list: &SweepList) -> Result<[f64; 3], LocalizerTrainError> {
     let mut sum = [0.0; 4];
     for index in (0..list.len()).step_by((list.len() / 200).max(1)) {
@@ -99,7 +99,8 @@ fn middle(list: &SweepList) -> Result<[f64; 3], LocalizerTrainError> {
     Ok(std::array::from_fn(|axis| sum[axis] / sum[3]))
 }
 
-/// Batches from `first` on. Every sweep is drawn anew, again where its pose is not known; [`middle`] has found one whose is.
+/// Batches from `first` on. Every sweep is drawn at random, again if its pose is unknown; [`middle`] has found at least
+/// one with a pose.
 fn batches(list: &Arc<SweepList>, encoder: &SceneEncoderConfig, run: &RunConfig, first: u64) -> Batches {
     let RunConfig { seed, batch, loader_threads, .. } = *run;
     let (list, encoder, batch) = (Arc::clone(list), encoder.clone(), batch as u64);

@@ -1,4 +1,4 @@
-//! Which cells come in which order, and how much they weigh.
+//! Order and weights of the cells of a training.
 
 use rand::SeedableRng;
 use rand::seq::SliceRandom;
@@ -7,7 +7,8 @@ use tch::{Kind, TchError, Tensor};
 
 use crate::training::{FeatureCache, Redundancy};
 
-/// An endless sequence of batches of cells, in a new order with every pass. A training that is resumed begins a new pass.
+/// An endless sequence of batches of cells, in a new order with every pass. A training that is resumed begins a new
+/// pass.
 pub(super) struct CellOrder {
     redundancy: Option<Redundancy>,
     sweep_of_cell: Tensor,
@@ -19,7 +20,7 @@ pub(super) struct CellOrder {
     place: usize,
     passes: f64,
     passes_before: f64,
-    /// Sweeps and errors of this pass's cells, while they are of interest.
+    /// Sweeps and errors of this pass's cells, while they are recorded.
     watched: Vec<(usize, f32)>,
     rng: ChaCha8Rng,
 }
@@ -48,12 +49,12 @@ impl CellOrder {
         })
     }
 
-    /// Passes done; one shows every cell that is used.
+    /// Number of passes done; one pass contains every cell that is used.
     pub(super) fn passes(&self) -> f64 {
         self.passes
     }
 
-    /// Weights `[N]` of cells by the sweeps `[N]` that they are of.
+    /// Weights `[N]` of cells by their sweeps `[N]`.
     pub(super) fn weights(&self, sweeps: &Tensor) -> Result<Tensor, TchError> {
         self.sweep_weights.f_index_select(0, sweeps)
     }
@@ -73,7 +74,7 @@ impl CellOrder {
         Ok(rows)
     }
 
-    /// Takes the errors `[N]` of the cells of a step, each of a sweep of `sweeps` `[N]`.
+    /// Records the errors `[N]` of the cells of a step, each of a sweep of `sweeps` `[N]`.
     pub(super) fn watch(&mut self, share_done: f64, sweeps: &Tensor, errors: &Tensor) -> Result<(), TchError> {
         if self.redundancy.as_ref().is_some_and(|redundancy| redundancy.watches(share_done)) {
             let errors: Vec<f32> = Vec::try_from(&errors.f_detach()?)?;
@@ -133,7 +134,7 @@ mod tests {
     }
 
     #[test]
-    fn sweeps_are_left_out_from_the_end_of_a_window_on_and_come_back() {
+    fn sweeps_are_left_out_from_the_end_of_a_window_and_used_again_later() {
         let redundancy = Redundancy::new(RedundancyConfig::default(), vec![0; 10]);
         let mut order = CellOrder::new(&cache(), Some(redundancy), 30, 1, 0).unwrap();
         let (mut steps, mut cells_of_pass) = (0, vec![0; 21]);
@@ -149,12 +150,12 @@ mod tests {
         }
         // Windows end after passes 5 and 10; from 84 % on, after pass 17, all are used again.
         assert_eq!([5, 6, 10, 11, 17, 18].map(|pass| cells_of_pass[pass]), [100, 80, 80, 60, 60, 100]);
-        assert_eq!(steps, 8 * 3 + 12 * 2, "three batches of a full pass, two of a decimate one");
+        assert_eq!(steps, 8 * 3 + 12 * 2, "three batches of a full pass, two of a reduced one");
     }
 
     #[test]
-    fn all_come_back_in_the_middle_of_a_long_pass() {
-        // Of four passes the first two are watched; the last is three eighths over when all are wanted again.
+    fn all_are_used_again_in_the_middle_of_a_long_pass() {
+        // The first two of four passes are recorded; the last is three eighths over when all are used again.
         let config = RedundancyConfig { windows: [[0.0, 0.5], [0.9, 0.95]], ..RedundancyConfig::default() };
         let mut order = CellOrder::new(&cache(), Some(Redundancy::new(config, vec![0; 10])), 10, 1, 0).unwrap();
         let mut cells = Vec::new();

@@ -1,4 +1,4 @@
-//! The classifier of a head, trained before its regressor: which cluster of sensor positions a sweep is of.
+//! Classifier of a head, trained before its regressor: assigns a sweep to a cluster of sensor positions.
 
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -9,15 +9,15 @@ use crate::training::FeatureCache;
 use localization::pgc::SceneHead;
 use perception::train::{AdamW, AdamWConfig, OneCycle};
 
-/// Steps and sweeps per step that it is trained with.
+/// Number of training steps.
 const STEPS: usize = 1500;
 const BATCH: usize = 256;
 /// Highest learning rate.
 const LEARNING_RATE: f64 = 2e-3;
-/// LightLoc's.
+/// Label smoothing, as in LightLoc.
 const LABEL_SMOOTHING: f64 = 0.1;
 
-/// Cross entropy with label smoothing; the share of training sweeps that end up in their class.
+/// Trains with cross entropy and label smoothing; the share of training sweeps that are classified correctly.
 pub(super) fn train_classifier(
     head: &SceneHead,
     variables: &VarStore,

@@ -1,30 +1,30 @@
-//! Poses as rough as those that the refiner meets, made from true ones.
+//! Coarse poses for the training of the refiner, drawn around true ones.
 
 use nalgebra::Isometry3;
 use tch::{Device, Kind, TchError, Tensor};
 
 use crate::training::sweep_store::heading_rad;
 
-/// Deviation of the largest errors that the refiner starts from, metres.
+/// Standard deviation of the largest position errors that the refiner starts from, metres.
 const MAX_ERROR_M: f64 = 2.5;
-/// Deviation of the heading that it starts from, radians.
+/// Standard deviation of the heading errors that it starts from, radians.
 const TURN_RAD: f64 = 0.015;
 
-/// Where a rough pose would put cells.
+/// Cell positions under coarse poses.
 #[derive(Debug)]
-pub(super) struct RoughPoses {
+pub(super) struct CoarsePoses {
     /// `[S]`: true heading of each sweep's sensor, radians.
     headings: Tensor,
 }
 
-impl RoughPoses {
+impl CoarsePoses {
     pub(super) fn new(world_from_sensor: &[Isometry3<f64>], device: Device) -> Result<Self, TchError> {
         let headings: Vec<f32> = world_from_sensor.iter().map(|pose| heading_rad(pose) as f32).collect();
         Ok(Self { headings: Tensor::f_from_slice(&headings)?.f_to_device(device)? })
     }
 
-    /// Places of cells `[N, 3]` moved at random, and cosine and sine of the heading `[N, 2]` turned at random; `sweeps`
-    /// `[N]` says which sweep a cell is of.
+    /// Positions of cells `[N, 3]` with random errors, and cosine and sine of the heading `[N, 2]` with random errors;
+    /// `sweeps` `[N]` is the sweep of each cell.
     pub(super) fn draw(&self, targets_m: &Tensor, sweeps: &Tensor) -> Result<(Tensor, Tensor), TchError> {
         let like = (Kind::Float, targets_m.device());
         let count = targets_m.size()[0];

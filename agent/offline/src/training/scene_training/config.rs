@@ -1,4 +1,4 @@
-//! What a training of a head is told, and what it tells.
+//! Configuration and reports of a training of a head.
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -6,18 +6,18 @@ use std::time::Duration;
 use crate::training::{RedundancyConfig, SceneAccuracy, SweepAugmentation};
 use perception::train::{DataListing, RunConfig, Trained};
 
-/// What to train, on what, for how long.
+/// Configuration of a training of a head.
 #[derive(Debug, Clone)]
 pub struct SceneTrainConfig {
-    /// Folders of scenes, all of one town.
+    /// Folders of sweeps, all of one scene.
     pub scenes: Vec<PathBuf>,
-    /// Folders of scenes of the same town to validate on; none: no validation.
+    /// Folders of sweeps of the same scene to validate on; none: no validation.
     pub validation: Vec<PathBuf>,
-    /// Sweeps of a validation.
+    /// Number of sweeps of a validation.
     pub validation_sweeps: usize,
     /// Weights of the encoder.
     pub encoder: PathBuf,
-    /// Name of the town.
+    /// Name of the scene.
     pub town: String,
     /// Clusters of sensor positions.
     pub classes: i64,
@@ -27,34 +27,34 @@ pub struct SceneTrainConfig {
     pub width: i64,
     /// Residual blocks of the head.
     pub blocks: usize,
-    /// Whether there is a second look.
+    /// True to train a refinement network.
     pub refiner: bool,
-    /// How sweeps are changed before they are encoded.
+    /// Augmentation of sweeps before they are encoded.
     pub augmentation: SweepAugmentation,
-    /// Which sweeps may be left out; nothing: none.
+    /// Selection of sweeps that may be left out; `None`: none.
     pub redundancy: Option<RedundancyConfig>,
-    /// How; a batch are cells, a time counts from the start, reading and encoding included.
+    /// Training run; a batch are cells, a time counts from the start, reading and encoding included.
     pub run: RunConfig,
     /// Time between two validations and checkpoints.
     pub validate_every: Duration,
 }
 
-/// Where a training of a head is.
+/// Progress of a training of a head.
 #[derive(Debug, Clone, PartialEq)]
 pub enum SceneReport {
-    /// Sweeps are being encoded: how many of how many are done.
+    /// Sweeps are being encoded: number done and number of all.
     Encoding(usize, usize),
-    /// All sweeps to learn from or to validate on are encoded.
+    /// All training and validation sweeps are encoded.
     Encoded(DataListing),
-    /// The classifier is done: share of training sweeps that it puts into their class.
+    /// The classifier is trained: share of training sweeps that it classifies correctly.
     Classified(f64),
     /// Some steps are done.
     Stepped {
-        /// Steps done.
+        /// Number of steps done.
         step: u64,
-        /// Passes over the data.
+        /// Number of passes over the data.
         epoch: f64,
-        /// Share that is done, 0..1.
+        /// Share of the training that is done, 0..1.
         share_done: f64,
         /// Seconds since the start.
         seconds: f64,
@@ -62,23 +62,23 @@ pub enum SceneReport {
         error_m: f64,
         /// Mean predicted error, metres.
         epsilon_m: f64,
-        /// Mean L1 error of the refiner's answers, metres.
+        /// Mean L1 error of the refiner's predictions, metres.
         refined_m: f64,
     },
     /// A validation is done, after so many seconds.
     Validated(f64, SceneAccuracy),
 }
 
-/// How a training of a head ended.
+/// Result of a training of a head.
 #[derive(Debug, Clone)]
 pub struct SceneSummary {
-    /// The weights and what it took, reading and encoding included.
+    /// Weights, steps and time, reading and encoding included.
     pub trained: Trained,
     /// Seconds before the head's first step.
     pub preparing_seconds: f64,
-    /// Sweeps it learnt from.
+    /// Number of training sweeps.
     pub sweeps: usize,
-    /// Cells it was shown.
+    /// Number of cells in all batches.
     pub cells_shown: u64,
     /// The last validation.
     pub accuracy: Option<SceneAccuracy>,

@@ -1,4 +1,4 @@
-//! What a head is trained and validated on: the frozen encoder's features of all sweeps.
+//! Features of the frozen encoder for the training and validation sweeps of a head.
 
 use std::sync::Arc;
 
@@ -7,13 +7,13 @@ use crate::training::{FeatureCache, LocalizerTrainError, SweepAugmentation, Swee
 use localization::pgc::{SceneEncoder, SceneEncoderConfig};
 use perception::train::DataListing;
 
-/// Features of the sweeps of a town.
+/// Features of the sweeps of a scene.
 pub(super) struct Features {
     pub(super) training: FeatureCache,
     pub(super) validation: Option<FeatureCache>,
     pub(super) encoder: SceneEncoderConfig,
     pub(super) encoder_sha256: String,
-    /// What the training ones are of.
+    /// Origin of the training features.
     pub(super) data: DataListing,
 }
 

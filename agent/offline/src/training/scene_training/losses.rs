@@ -1,27 +1,27 @@
-//! What a head is trained towards.
+//! Losses of a head.
 
 use tch::{Kind, TchError, Tensor};
 
 use localization::pgc::Regression;
 
-/// Centres share a cell by their distance over this, metres.
+/// Scale of the distance in the target weights of the centres, metres.
 const CENTRE_BLUR_M: f64 = 4.0;
 
-/// Eq. 4 and 5, each cell by its weight; also the L1 errors `[N]`.
+/// Eq. 4 and 5 with a weight per cell; also the L1 errors `[N]`.
 pub(super) fn weighted_loss(
     answer: &Regression,
     targets_m: &Tensor,
     weights: &Tensor,
 ) -> Result<(Tensor, Tensor), TchError> {
     let error = (&answer.coordinates_m - targets_m).f_abs()?.f_sum_dim_intlist(1_i64, false, Kind::Float)?;
-    // The error is learnt from, not bent towards its prediction: the second term moves epsilon alone.
+    // The error is the target of its prediction: the second term has a gradient for epsilon alone.
     let surprise = (error.f_detach()? - &answer.epsilon_m).f_abs()?;
     Ok((((&error + surprise) * weights).f_mean(Kind::Float)?, error))
 }
 
-/// Cross entropy between the shares of the centres and how near they really are.
+/// Cross entropy between the weights of the centres and their true proximity.
 ///
-/// Coordinates alone teach which centre is right only through their mean, which several wrong ones can make up together.
+/// The coordinate loss alone constrains only the mean of the centres, which several wrong ones can produce together.
 pub(super) fn centre_loss(
     log_shares: &Tensor,
     targets_m: &Tensor,

@@ -1,11 +1,11 @@
-//! Second stage: the head of one town, on features of the frozen encoder that are computed once.
+//! Second stage: the head of one scene, on features of the frozen encoder that are computed once.
 
 mod cell_order;
 mod classifier;
 mod coarse_pose;
 mod config;
 mod features;
-mod lattice;
+mod key_grid;
 mod losses;
 mod statistics;
 
@@ -18,7 +18,7 @@ use tch::{Kind, Tensor, no_grad};
 pub use self::config::{SceneReport, SceneSummary, SceneTrainConfig};
 
 use self::cell_order::CellOrder;
-use self::coarse_pose::RoughPoses;
+use self::coarse_pose::CoarsePoses;
 use self::features::Features;
 use self::losses::{centre_loss, weighted_loss};
 use super::error::LocalizerTrainError;
@@ -31,13 +31,13 @@ use localization::pgc::SceneHeadConfig;
 use perception::train::{Curve, DataListing, Length, Trainer};
 use perception::weights::{CONFIG_KEY, KIND_KEY};
 
-/// What a unit of cross entropy over the centres weighs, metres.
+/// Weight of a unit of cross entropy over the centres, metres.
 const CENTRE_WEIGHT_M: f64 = 5.0;
-/// Steps between two draws of what drops out of the classifier.
+/// Steps between two draws of the classifier's dropout.
 const LOGITS_EVERY: u64 = 50;
 /// Steps between two reports.
 const REPORT_EVERY: u64 = 20;
-/// Cells of a sweep that a head regresses at most.
+/// Largest number of cells of a sweep that a head regresses.
 const MAX_CELLS: usize = 1024;
 
 /// Trains a head; writes checkpoint, curve and weights into `config.run.out`.
@@ -56,11 +56,11 @@ pub fn train_scene(
             observe(&training.report());
         }
         if last_validation.elapsed() >= config.validate_every {
-            training.look_back(observe)?;
+            training.validate_and_save(observe)?;
             last_validation = Instant::now();
         }
     }
-    training.look_back(observe)?;
+    training.validate_and_save(observe)?;
     training.finish()
 }
 
@@ -73,13 +73,13 @@ struct Training<'a> {
     head: SceneHead,
     trainer: Trainer,
     order: CellOrder,
-    rough_poses: RoughPoses,
-    /// What the classifier says of each sweep at the moment.
+    coarse_poses: CoarsePoses,
+    /// Current logits of the classifier for each sweep.
     logits: Option<Tensor>,
     cells_shown: u64,
     window: Window,
     /// The window of the last report.
-    told: Window,
+    reported: Window,
     accuracy: Option<SceneAccuracy>,
     curve: Curve,
     data: DataListing,
@@ -116,13 +116,13 @@ impl<'a> Training<'a> {
             variables,
             head,
             order: CellOrder::new(&cache, redundancy, run.batch, run.seed, trainer.steps())?,
-            rough_poses: RoughPoses::new(&cache.world_from_sensor, run.device)?,
+            coarse_poses: CoarsePoses::new(&cache.world_from_sensor, run.device)?,
             cache,
             validation,
             logits: None,
             cells_shown: 0,
             window: Window::default(),
-            told: Window::default(),
+            reported: Window::default(),
             accuracy: None,
             curve: trainer.curve(header)?,
             trainer,
@@ -134,7 +134,7 @@ impl<'a> Training<'a> {
     fn share_done(&self) -> f64 {
         match self.config.run.length {
             Length::Time(limit) => {
-                // The schedule of the head begins when the features are there.
+                // The schedule of the head begins when the features are computed.
                 let limit = (limit.as_secs_f64() - self.preparing_seconds).max(1.0);
                 (self.trainer.seconds() - self.preparing_seconds) / limit
             }
@@ -150,7 +150,8 @@ impl<'a> Training<'a> {
         let cells = self.head.normalise(&self.cache.cells.f_index_select(0, &rows)?)?;
         let logits = match self.logits.take() {
             Some(logits) if !self.trainer.steps().is_multiple_of(LOGITS_EVERY) => logits,
-            // Channels drop out here too: where nobody has driven the classifier is less sure than on what it has seen.
+            // Dropout here too: in places without training data the classifier is less certain than on its training
+            // sweeps.
             _ => no_grad(|| self.head.classify(&self.cache.sweeps, true))?,
         };
         let kind = self.config.run.precision.kind();
@@ -162,7 +163,7 @@ impl<'a> Training<'a> {
         let (mut loss, error) = weighted_loss(&regression, &targets, &weights)?;
         loss += centre_loss(&log_shares, &targets, self.head.centres_m(), &weights)? * CENTRE_WEIGHT_M;
         if let Some(refiner) = self.head.refiner() {
-            let (assumed, heading) = self.rough_poses.draw(&targets, &sweeps)?;
+            let (assumed, heading) = self.coarse_poses.draw(&targets, &sweeps)?;
             let answer = refiner.look(&cells, &assumed, &heading, kind)?;
             let (refiner_loss, refined) = weighted_loss(&answer, &targets, &weights)?;
             loss += refiner_loss;
@@ -178,24 +179,24 @@ impl<'a> Training<'a> {
     }
 
     fn report(&mut self) -> SceneReport {
-        // A validation right after a report has nothing newer to tell.
+        // A validation right after a report has no newer steps to report.
         if self.window.steps > 0 {
-            self.told = std::mem::take(&mut self.window);
+            self.reported = std::mem::take(&mut self.window);
         }
-        let mean = |sum: f64| sum / f64::from(self.told.steps.max(1));
+        let mean = |sum: f64| sum / f64::from(self.reported.steps.max(1));
         SceneReport::Stepped {
             step: self.trainer.steps(),
             epoch: self.order.passes(),
             share_done: self.share_done().min(1.0),
             seconds: self.trainer.seconds(),
-            error_m: mean(self.told.error_m),
-            epsilon_m: mean(self.told.epsilon_m),
-            refined_m: mean(self.told.refined_m),
+            error_m: mean(self.reported.error_m),
+            epsilon_m: mean(self.reported.epsilon_m),
+            refined_m: mean(self.reported.refined_m),
         }
     }
 
-    /// Validation and checkpoint.
-    fn look_back(&mut self, observe: &mut dyn FnMut(&SceneReport)) -> Result<(), LocalizerTrainError> {
+    /// Validates and writes a checkpoint.
+    fn validate_and_save(&mut self, observe: &mut dyn FnMut(&SceneReport)) -> Result<(), LocalizerTrainError> {
         let report = self.report();
         let SceneReport::Stepped { error_m, epsilon_m, .. } = report else { unreachable!("a report of steps") };
         let seconds = self.trainer.seconds();
@@ -217,7 +218,7 @@ impl<'a> Training<'a> {
     }
 
     fn finish(mut self) -> Result<SceneSummary, LocalizerTrainError> {
-        let variables = lattice::crop(&mut self.head_config, self.variables, &self.cache.targets_m)?;
+        let variables = key_grid::crop(&mut self.head_config, self.variables, &self.cache.targets_m)?;
         let about = BTreeMap::from([
             (CONFIG_KEY.to_owned(), serde_json::to_string(&self.head_config).expect("a configuration is JSON")),
             (KIND_KEY.to_owned(), SceneHead::KIND.to_owned()),
@@ -232,10 +233,10 @@ impl<'a> Training<'a> {
     }
 }
 
-/// The head that `config` asks for, for these features.
+/// The configuration of the head for these features.
 fn head_config(config: &SceneTrainConfig, features: &Features) -> Result<SceneHeadConfig, LocalizerTrainError> {
     let Features { training, encoder, encoder_sha256, .. } = features;
-    let refiner = || lattice::covering(&training.targets_m, encoder.local_channels());
+    let refiner = || key_grid::covering(&training.targets_m, encoder.local_channels());
     Ok(SceneHeadConfig {
         town: config.town.clone(),
         encoder_sha256: encoder_sha256.clone(),

@@ -1,4 +1,4 @@
-//! What a head knows of its town before it learns: statistics of the features, and centres among the world coordinates.
+//! Statistics of a scene that a head has before its training: mean and deviation of features, centres of coordinates.
 
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -7,10 +7,10 @@ use tch::{TchError, Tensor};
 use crate::training::{FeatureCache, kmeans};
 use localization::pgc::SceneHead;
 
-/// Cells that both are computed from.
+/// Number of cells that both are computed from.
 const SAMPLE: usize = 20_000;
 
-/// Sets both, repeatable by `seed`.
+/// Sets both, reproducibly by `seed`.
 pub(super) fn set_statistics(head: &mut SceneHead, cache: &FeatureCache, seed: u64) -> Result<(), TchError> {
     let centre_count = head.config().centres as usize;
     let mut rng = ChaCha8Rng::seed_from_u64(seed);

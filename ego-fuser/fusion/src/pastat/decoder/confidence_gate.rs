@@ -1,11 +1,11 @@
-//! Weight of a neighbour's map, token by token.
+//! Confidence gate: weight of a neighbour's feature map, token by token.
 
 use tch::nn::{self, Init, Module};
 use tch::{TchError, Tensor};
 
 use crate::pastat::config::PastatConfig;
 
-/// How much of a neighbour's newest map is taken, token by token: 1 before it is trained, 0 to 2 after.
+/// Predicts the weight of a neighbour's newest map, token by token: 1 before training, 0 to 2 after.
 #[derive(Debug)]
 pub(super) struct ConfidenceGate {
     hidden: nn::Linear,

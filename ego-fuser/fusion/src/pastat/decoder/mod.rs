@@ -1,4 +1,5 @@
-//! Decoder: the context of the transformer and the aligned maps become one map, which the detection head of Eq. 3 reads.
+//! Decoder: the context of the transformer and the aligned maps become one map, which the detection head of Eq. 3
+//! reads.
 
 mod confidence_gate;
 
@@ -12,8 +13,8 @@ use super::spatial_alignment::FineMaps;
 use super::temporal_encoding::Tokens;
 use crate::f64_tensor;
 
-/// Tokens back to cells. The context of the transformer comes back in two ways: as a weight of each neighbour's newest map, of
-/// which the maximum is taken, and as a change of that; neutral before it is trained.
+/// Tokens back to cells. The context of the transformer is used in two ways: as a weight of each neighbour's newest
+/// map, of which the maximum is taken, and as an additive change of that; neutral before training.
 #[derive(Debug)]
 pub(super) struct Decoder {
     gate: ConfidenceGate,
@@ -39,10 +40,10 @@ impl Decoder {
         }
     }
 
-    /// `[1, C, H, W]`: the maximum of the ego's map and its neighbours' newest ones, these by the weights of the gate.
+    /// `[1, C, H, W]`: the maximum of the ego's map and its neighbours' newest ones, weighted by the gate.
     ///
     /// # Shapes
-    /// - `tokens`: of all entries, as the transformer got them
+    /// - `tokens`: of all entries, as input to the transformer
     /// - `context`: `[1, h, w, D]`, the ego's tokens after the transformer
     pub(super) fn maximum(&self, maps: &FineMaps, tokens: &Tokens, context: &Tensor) -> Result<Tensor, TchError> {
         let FineMaps { own, neighbours, .. } = maps;
@@ -54,11 +55,12 @@ impl Decoder {
         neighbours.maximum_with(own, &weight)
     }
 
-    /// What the context adds to a map: `[1, C, H, W]` of tokens `[1, h, w, D]`, the channels of a cell side by side in memory.
+    /// Additive change of a map by the context: `[1, C, H, W]` of tokens `[1, h, w, D]`, the channels of a cell
+    /// contiguous in memory.
     pub(super) fn change(&self, ego: &Tensor) -> Result<Tensor, TchError> {
         let (_, rows, columns, dim) = ego.size4()?;
         let Self { channels, patch, .. } = *self;
-        // Weights are kept by channel and then by cell; few as they are, they are cheaper to turn than what they make.
+        // Weights are stored by channel and then by cell; transposing these few is cheaper than transposing the result.
         let by_cell = |weights: &Tensor, each: i64| {
             weights.f_view([channels, patch * patch, each])?.f_transpose(0, 1)?.f_reshape([-1, each])
         };

@@ -1,8 +1,8 @@
-//! Alignment search, an extension of FSA: finds maps that lie further from where their poses put them than the network can tell.
+//! Alignment search, an extension of FSA: finds maps whose offset exceeds the range of the alignment network.
 //!
-//! Measured gain: one neighbour 14 m off with full confidence costs 0.9 instead of 2.9 points of AP@0.5 (ablation, FSA with search);
-//! comparing closely at both places and once more gives 0.7 points of AP@0.7 with all poses 1 m off, turns 1.5 with poses 4 m and
-//! 4 degrees off.
+//! Measured gain: one neighbour 14 m off with full confidence costs 0.9 instead of 2.9 percentage points of AP@0.5
+//! (ablation, FSA with search). A fine comparison at both places and a repeated comparison give 0.7
+//! percentage points of AP@0.7 with all poses 1 m off; rotations give 1.5 with poses 4 m and 4 degrees off.
 
 use protocol::Pose;
 use tch::{Kind, TchError, Tensor};
@@ -14,23 +14,23 @@ use crate::pastat::spatial_alignment::network::AlignmentNetwork;
 use crate::pastat::spatial_alignment::pairs::{Displacements, Pairs, picked, rows_where};
 use crate::warp::{BILINEAR, PADDING_ZEROS};
 
-/// A map belongs far from where its pose puts it when its correlation with the ego's, compared as closely at both places, is
+/// A map is moved to the position of the search when its correlation with the ego's, in the fine comparison, is
 /// higher there by more than this.
 const MARGIN: f64 = 0.05;
-/// A map that was moved further than this, about half a cell of `lean`'s lattice, is compared again where it lies then.
+/// A map that was moved further than this, about half a cell of `lean`'s grid, is compared again at its new position.
 const AGAIN_M: f64 = 0.45;
 
-/// Turns that are tried beside none, radians: FSA undoes what lies between two of them.
+/// Rotations that are tried besides none, radians: FSA corrects rotations between two of them.
 const TURNS_RAD: [f64; 8] = [-0.08, 0.08, -0.16, 0.16, -0.24, 0.24, -0.32, 0.32];
-/// A turned map is looked for up to so many large cells away: a try is cheap then, and few err far in both.
+/// Largest offset of a rotated map, pooled cells: a small search is cheap, and few poses err far in both.
 const TURNED_RADIUS: i64 = 4;
-/// A turned map has to fit better by this, as one of many tries fits better by chance.
+/// A rotated map has to correlate better by this, since one of many trials correlates better by chance.
 const TURN_MARGIN: f64 = 0.03;
 
-/// Comparisons beside the one where poses put maps.
+/// Comparisons besides the one at the poses.
 #[derive(Debug)]
 pub(crate) struct AlignmentSearch {
-    /// Absent: maps are looked for nowhere else.
+    /// Absent: no search.
     config: Option<SearchConfig>,
 }
 
@@ -39,8 +39,8 @@ impl AlignmentSearch {
         Self { config }
     }
 
-    /// Displacements by the network. Outside of training it compares up to three times: where poses put maps, where the search
-    /// finds a better fit, and where those were moved. Training goes by the first comparison, and searches shifts alone.
+    /// Displacements by the network. Outside training it compares up to three times: at the poses, at better positions
+    /// of the search, and once more after large moves. Training uses the first comparison, and searches shifts only.
     pub(crate) fn displacements(
         &self,
         network: &AlignmentNetwork,
@@ -62,8 +62,8 @@ impl AlignmentSearch {
     }
 }
 
-/// Those found `near` where poses put maps, or around `far` `[K, 3]`, metres and radians in the ego's frame, where maps fit better
-/// there.
+/// Displacements of the comparison at the poses, `near`, or at `far` `[K, 3]`, metres and radians in the ego's frame,
+/// where the correlation is higher there.
 fn compare_there(
     network: &AlignmentNetwork,
     pairs: &Pairs,
@@ -81,7 +81,7 @@ fn compare_there(
     near.with(&rows, &there.only(&better)?)
 }
 
-/// The same, compared again where they lie then for maps that were moved by some distance.
+/// The same, compared again at the new position for maps that were moved by more than [`AGAIN_M`].
 fn compare_again(
     network: &AlignmentNetwork,
     pairs: &Pairs,
@@ -97,14 +97,15 @@ fn compare_again(
     found.with(&rows, &again)
 }
 
-/// How far each map lies from where its pose puts it, to the large cell, `[K, 3]` along x and y, metres, and about its sender,
-/// radians: what FSA compares is compared once more with large cells and far around, and what fits better somewhere else
-/// belongs there.
+/// Coarse offset of each map from its pose, to the pooled cell, `[K, 3]` along x and y, metres, and about its sender,
+/// radians: the reduced maps are correlated once more with pooled cells over a large range, and the best position is
+/// taken.
 ///
-/// Training has a margin for that and tries shifts alone. No gradient flows: what is compared is learnt from near.
+/// Training adds a margin and tries shifts only. No gradient flows: the reduced maps are learnt from the fine
+/// comparison.
 ///
 /// # Shapes
-/// - `ego`, `others`: `[1, M, H, W]`, `[K, M, H, W]`: what is compared, on the lattice of `area`
+/// - `ego`, `others`: `[1, M, H, W]`, `[K, M, H, W]`: reduced maps, on the grid of `area`
 /// - `ego_from_cav`: `K` poses of the maps' senders
 fn offsets(
     [ego, others]: [&Tensor; 2],
@@ -132,7 +133,7 @@ fn offsets(
     Tensor::f_cat(&offsets, 0)?.f_to_device(best.device())?.f_index_select(0, &best)
 }
 
-/// Of each turn how well maps fit, `[K, P]`, less the margin, and the offsets `[P, 3]` of which that is.
+/// Correlations of each rotation, `[K, P]`, less the margin, and the offsets `[P, 3]` of the columns.
 fn turned_tries(
     [ego, others]: [&Tensor; 2],
     ego_from_cav: &[Pose],
@@ -150,7 +151,7 @@ fn turned_tries(
     fit.f_split(others.size4()?.0, 0)?.into_iter().zip(TURNS_RAD).map(of_turn).collect()
 }
 
-/// Maps turned about their senders.
+/// Maps rotated about their senders.
 fn turned(maps: &Tensor, turn_rad: f64, ego_from_cav: &[Pose], area: &Area) -> Result<Tensor, TchError> {
     let (count, _, rows, columns) = maps.size4()?;
     let turn = Tensor::f_from_slice(&[0.0, 0.0, turn_rad as f32])?.f_expand([count, 3], false)?;
@@ -179,13 +180,13 @@ mod tests {
         Area::new(&GRID, [64, 96], 4)
     }
 
-    /// Vehicles here and there, zero in the mean.
+    /// Synthetic vehicles at some places, zero mean.
     fn map(seed: u64) -> Tensor {
         let cells = uniform(seed, &[1, 2, 64, 96]).gt(0.99).to_kind(Kind::Float);
         &cells - cells.mean(Kind::Float)
     }
 
-    /// Seen by senders where the ego is.
+    /// Offsets found for senders at the ego's position.
     fn found(maps: [&Tensor; 2], area: &Area, config: SearchConfig, train: bool) -> Vec<f32> {
         let poses = vec![Pose::IDENTITY; maps[1].size()[0] as usize];
         Vec::try_from(offsets(maps, &poses, area, config, train).unwrap().view(-1)).unwrap()
@@ -194,18 +195,18 @@ mod tests {
     #[test]
     fn a_lost_map_is_found_and_others_stay() {
         let ego = map(1);
-        // Where its pose puts it; twelve cells too far along x and sixteen back along y; somebody else's.
+        // At its pose; twelve cells too far along x and sixteen back along y; a map of another scene.
         let others = Tensor::cat(&[&ego, &ego.roll([-16, 12], [2, 3]), &map(2)], 0);
         let expected = [0.0, 0.0, 0.0, -6.0, 8.0, 0.0, 0.0, 0.0, 0.0];
         assert_eq!(found([&ego, &others], &area(), CONFIG, true), expected);
-        // The same in cells of two by two, of which two by two are a large cell.
+        // The same in cells of two by two, of which two by two are a pooled cell.
         let [ego, others] = [&ego, &others].map(|maps| maps.avg_pool2d([2, 2], [2, 2], [0, 0], false, true, None));
         assert_eq!(found([&ego, &others], &area().with_cells_of(2), CONFIG, true), expected);
     }
 
     #[test]
     fn once_trained_a_turned_map_is_found() {
-        // Vehicles of several large cells, which a turn on large cells leaves what they are.
+        // Vehicles of several pooled cells, whose shape a rotation on pooled cells preserves.
         let ego = map(1).avg_pool2d([9, 9], [1, 1], [4, 4], false, true, None);
         for turn_rad in TURNS_RAD {
             let turned = turned(&ego, -turn_rad, &[Pose::IDENTITY], &area()).unwrap();
@@ -215,13 +216,13 @@ mod tests {
             let expected = [0.0, 0.0, 0.0, 0.0, 0.0, turn_rad];
             let found = found([&ego, &others], &area(), CONFIG, false);
             assert_eq!(found[..6], expected);
-            // Turned about where its sender is, after which the shift is another.
+            // Rotated about the sender, which changes the remaining shift.
             assert_eq!(found[8], turn_rad);
         }
     }
 
     #[test]
-    fn in_training_what_fits_better_by_less_than_the_margin_stays() {
+    fn in_training_a_gain_below_the_margin_moves_nothing() {
         let ego = map(1);
         let other = ego.roll([12], [3]) * 0.6 + &ego * 0.5;
         let with = |margin, train| found([&ego, &other], &area(), SearchConfig { margin, ..CONFIG }, train);
@@ -230,8 +231,8 @@ mod tests {
         assert_eq!(with(0.2, false), [-6.0, 0.0, 0.0]);
     }
 
-    /// What FSA with some search does to maps: the ego's; the same twelve cells too far along x and sixteen back along y; and
-    /// somebody else's.
+    /// Corrections of FSA with a search for three maps: the ego's; the same twelve cells too far along x and sixteen
+    /// back along y; and a map of another scene.
     fn far_off(search: SearchConfig, train: bool) -> Vec<f32> {
         let grid = BevGrid { x_min_m: -24.0, y_min_m: -16.0, cell_m: 0.5, width: 96, height: 64 };
         let (area, confidences) = (Area::new(&grid, [64, 96], 4), Tensor::ones([3, CONFIDENCES], FLOAT));
@@ -259,19 +260,19 @@ mod tests {
         let back = [0.0, 0.0, 0.0, -6.0, 8.0, 0.0, 0.0, 0.0, 0.0];
         assert_eq!(far_off(search, true), back);
         assert_eq!(far_off(search, false), back);
-        // Beyond what is searched it is not found.
+        // Beyond the search range it is not found.
         assert_eq!(far_off(SearchConfig { radius: 1, ..search }, false), [0.0; 9]);
     }
 
     #[test]
-    fn once_trained_it_compares_closely_what_a_margin_would_have_left() {
+    fn after_training_offsets_below_the_margin_are_compared_closely() {
         let search = SearchConfig { cells: 4, radius: 9, margin: 2.0 };
         assert_eq!(far_off(search, true), [0.0; 9]);
         assert_eq!(far_off(search, false), [0.0, 0.0, 0.0, -6.0, 8.0, 0.0, 0.0, 0.0, 0.0]);
     }
 
     #[test]
-    fn a_second_look_takes_away_what_the_first_has_left() {
+    fn a_second_comparison_reduces_the_remaining_offset() {
         let variables = VarStore::new(Device::Cpu);
         let fsa = AlignmentNetwork::new(
             &variables.root(),
@@ -280,7 +281,7 @@ mod tests {
         );
         let area = Area::new(&BevGrid { width: 32, height: 16, x_min_m: -8.0, y_min_m: -4.0, ..GRID }, [16, 32], 4);
         redraw(&variables, &["matching"], 0.3);
-        // A part of the motion that is seen is taken.
+        // Only a share of the observed motion is applied.
         let _ = no_grad(|| variables.variables()["delta.bias"].narrow(0, 3, 3).fill_(0.6));
         let map = uniform(5, &[1, 4, 16, 32]).gt(0.97).to_kind(Kind::Float);
         let maps = [map.shallow_clone(), map.roll([3], [3])]

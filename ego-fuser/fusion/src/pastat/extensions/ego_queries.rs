@@ -1,30 +1,30 @@
-//! Ego queries, an extension: only the tokens of the ego's newest map ask in the attention over agents and time (`rows: ego`;
-//! `all`: off), since only they are kept in the end.
+//! Ego queries, an extension: only the tokens of the ego's newest map are queries in the attention over agents and time
+//! (`rows: ego`; `all`: off), since only they are used in the end.
 //!
-//! Attention is then one pass over the tokens, where tensor operations pass over all of them a dozen times. Numbers only: on the
-//! CPU, without gradients. Measured gain: not measured alone; every training that is in the tables has it.
+//! Attention is then one pass over the tokens, where tensor operations pass over all of them a dozen times. Plain
+//! floats: on the CPU, without gradients. Measured gain: not measured separately; every training in the tables has it.
 
 use tch::{TchError, Tensor};
 
 use crate::f64_tensor::numbers;
 
-/// Cells that are worked on together: their numbers fit into a core's nearest cache.
+/// Cells that are processed together: their data fit into a core's L1 cache.
 const STRIP: usize = 64;
 /// As in `LayerNormConfig`.
 const EPSILON: f32 = 1e-5;
 
-/// The tokens of all entries but the ego's newest, and which of all count.
+/// The tokens of all entries but the ego's newest, and the validity of all.
 pub(crate) struct Others {
     /// `[N - 1, D, cells]`.
     tokens: Vec<f32>,
-    /// `[N, cells]`, 0 for tokens that do not count; the ego's newest first.
+    /// `[N, cells]`, 0 for invalid tokens; the ego's newest first.
     valid: Vec<f32>,
     dim: usize,
     cells: usize,
 }
 
 impl Others {
-    /// Of the tokens of all `[N, D, h, w]`, of which `valid` `[N, h, w]` count.
+    /// From the tokens of all entries `[N, D, h, w]` and their validity `[N, h, w]`.
     pub(crate) fn of(tokens: &Tensor, valid: &Tensor) -> Result<Self, TchError> {
         let (entries, dim, height, width) = tokens.size4()?;
         let others = tokens.f_narrow(0, 1, entries - 1)?;
@@ -32,11 +32,11 @@ impl Others {
         Ok(Self { tokens: numbers(&others)?, valid: numbers(valid)?, dim, cells })
     }
 
-    /// For each head and cell the mean of all entries' normalised tokens, weighted by how well they answer what the head
-    /// asks there, `[heads, D, cells]`. A cell where nothing counts takes all alike.
+    /// For each head and cell the mean of all entries' normalised tokens, weighted by the attention of the head's
+    /// query, `[heads, D, cells]`. At a cell without valid tokens all have equal weight.
     ///
     /// # Shapes
-    /// - `asked`: `[heads, D, cells]`: a token's product with it is its score
+    /// - `asked`: `[heads, D, cells]`: the score of a token is its product with it
     /// - `ego`: `[D, cells]`, the tokens of the ego's newest
     pub(crate) fn gather(&self, asked: &[f32], ego: &[f32]) -> Vec<f32> {
         let size = self.dim * self.cells;
@@ -59,13 +59,13 @@ impl Others {
 /// A number for each cell of a strip.
 type Row = [f32; STRIP];
 
-/// What a layer norm takes away from the tokens of a strip, and what it multiplies with then.
+/// Offset and factor of the layer norm for the tokens of a strip.
 struct Normal {
     mean: Row,
     scale: Row,
 }
 
-/// Some cells one after another.
+/// Some consecutive cells.
 struct Strip<'a> {
     first: usize,
     count: usize,

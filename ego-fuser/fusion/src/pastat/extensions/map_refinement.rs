@@ -1,17 +1,17 @@
-//! Map refinement, an extension: two convolutions sharpen the fused map (`refine`; absent: off).
+//! Map refinement, an extension: two convolutions refine the fused map (`refine`; absent: off).
 //!
-//! Measured gain: not measured alone; every training that is in the tables has it.
+//! Measured gain: not measured separately; every training in the tables has it.
 
 use tch::nn::{self, Init};
 use tch::{Kind, TchError, Tensor};
 
 use crate::pastat::precision::{convolve, fastest};
 
-/// Sharpens the fused map, cell by cell and its neighbours, by what it shows itself: maps were blurred when they were
-/// moved, and heads of one cell cannot mend that. Changes nothing before it is trained.
+/// Refines the fused map from its own cells and their neighbours: the warp blurs maps, and 1x1 heads cannot correct
+/// that. Changes nothing before it is trained.
 ///
-/// Most of the time of a fusion goes here. Processors that multiply bfloat16 natively do so, several times faster than in
-/// single precision; what is lost is a 256th of a change. Trainings are in single precision everywhere.
+/// Most of the time of a fusion is spent here. Processors with native bfloat16 multiplication do it several times
+/// faster than in single precision; the loss is a 256th of a change. All trainings are in single precision.
 #[derive(Debug)]
 pub(crate) struct MapRefinement {
     convolutions: [nn::Conv2D; 2],
@@ -37,7 +37,7 @@ impl MapRefinement {
         Ok(fused + self.change(fused, kind)?)
     }
 
-    /// What is added, computed in `kind`.
+    /// Additive change, computed in `kind`.
     fn change(&self, fused: &Tensor, kind: Kind) -> Result<Tensor, TchError> {
         let [first, second] = &self.convolutions;
         let hidden = convolve(first, &fused.f_to_kind(kind)?)?.f_relu()?;
@@ -53,7 +53,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn both_precisions_say_the_same() {
+    fn both_precisions_agree() {
         tch::set_num_threads(1);
         let variables = VarStore::new(Device::Cpu);
         let refinement = MapRefinement::new(&variables.root(), 8, 12);

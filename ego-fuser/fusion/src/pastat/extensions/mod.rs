@@ -1,5 +1,5 @@
-//! Extensions of PASTAT: steps that are not in the paper. Each can be switched off in the configuration, and each file says what
-//! it has gained where that was measured.
+//! Extensions of PASTAT: steps that are not in the paper. Each can be switched off in the configuration, and each file
+//! states the gain where it was measured.
 //!
 //! | step | setting | off |
 //! | --- | --- | --- |

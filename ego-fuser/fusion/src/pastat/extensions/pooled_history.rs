@@ -1,4 +1,5 @@
-//! Pooled history, an extension: earlier maps are kept, warped and compared with larger cells (`earlier_cells`; 1: off).
+//! Pooled history, an extension: earlier maps are kept, warped and compared with larger cells (`earlier_cells`; 1:
+//! off).
 //!
 //! Measured gain: none in precision; with cells of 2 by 2 warping an earlier map takes a quarter of the time.
 
@@ -7,7 +8,7 @@ use tch::TchError;
 use crate::maps::larger_cells;
 use crate::warp::WarpedMaps;
 
-/// Maps with cells of `cells` by `cells`; a larger cell is valid where any of its cells is.
+/// Maps pooled to cells of `cells` by `cells`; a pooled cell is valid where any of its cells is.
 pub(crate) fn pooled(maps: &WarpedMaps, cells: i64) -> Result<WarpedMaps, TchError> {
     let WarpedMaps { features, mask } = maps;
     Ok(WarpedMaps { features: larger_cells(features, cells)?, mask: larger_cells(mask, cells)?.f_ceil()? })

@@ -1,4 +1,4 @@
-//! The area that maps show, and maps moved on it.
+//! Area of feature maps, and resampling of maps that are moved on it.
 
 use protocol::{BevGrid, Pose};
 use tch::{Kind, TchError, Tensor};
@@ -14,14 +14,15 @@ pub(crate) struct Area {
     /// Rows and columns.
     size: [i64; 2],
     cell_m: f64,
-    /// Cells of the ego's lattice along each edge of a cell.
+    /// Cells of the ego's grid along each edge of a cell.
     cells: i64,
-    /// Cells are compared with those of the ego up to so many cells away.
+    /// Largest offset between compared cells, cells.
     radius: i64,
 }
 
 impl Area {
-    /// The area of `height` x `width` cells that begin where `grid` begins; maps are compared up to `radius` cells away.
+    /// The area of `height` x `width` cells that begin where `grid` begins; maps are compared up to `radius` cells
+    /// away.
     pub(crate) fn new(grid: &BevGrid, [height, width]: [i64; 2], radius: i64) -> Self {
         let half_m = [width as f64 * grid.cell_m / 2.0, height as f64 * grid.cell_m / 2.0];
         Self {
@@ -46,24 +47,24 @@ impl Area {
         self.cell_m
     }
 
-    /// Cells of the ego's lattice along each edge of a cell.
+    /// Cells of the ego's grid along each edge of a cell.
     pub(crate) fn cells(&self) -> i64 {
         self.cells
     }
 
-    /// Where vehicles are, metres from the middle of the area, `[N, 2]`.
+    /// Positions of vehicles, metres from the centre of the area, `[N, 2]`.
     pub(crate) fn places_of(&self, ego_from_cav: &[Pose]) -> Result<Tensor, TchError> {
         let place = |pose: &Pose| [0, 1].map(|axis| (pose.translation_m[axis] - self.middle_m[axis]) as f32);
         let places: Vec<f32> = ego_from_cav.iter().flat_map(place).collect();
         Tensor::f_from_slice(&places)?.f_view([-1, 2])
     }
 
-    /// Cells are compared with those of the ego up to so many cells away.
+    /// Largest offset between compared cells, cells.
     pub(crate) fn radius(&self) -> i64 {
         self.radius
     }
 
-    /// `[PARTS^2, 2]`: the middles of the parts that maps are compared by, metres from the middle of the area.
+    /// `[PARTS^2, 2]`: centres of the compared parts, metres from the centre of the area.
     pub(crate) fn middles_of_parts(&self) -> Result<Tensor, TchError> {
         let along = |part: i64, half_m: f64| (((2 * part + 1) as f64 / PARTS as f64 - 1.0) * half_m) as f32;
         let [half_x, half_y] = self.half_m;
@@ -74,34 +75,34 @@ impl Area {
     }
 }
 
-/// Where the cells of the ego's lattice lie on maps that are moved by `deltas` `[N, 3]`, for `grid_sampler`: `[N, H, W, 2]`.
+/// Positions of the ego's cells on maps that are moved by `deltas` `[N, 3]`, for `grid_sampler`: `[N, H, W, 2]`.
 ///
-/// A map is turned about the place of the vehicle that made it and then shifted, both in the ego's frame, so that an
-/// error of its pose's heading is one number and not three.
+/// A map is rotated about the position of its sender and then shifted, both in the ego's frame, so that an error of its
+/// pose's heading affects one number and not three.
 pub(crate) fn lattice(deltas: &Tensor, ego_from_cav: &[Pose], area: &Area, size: [i64; 2]) -> Result<Tensor, TchError> {
-    let senders = said(ego_from_cav)?.f_to_device(deltas.device())?.f_narrow(1, 0, 2)?;
-    // p_map = v + R^T (p_ego - v - d), with v the vehicle's place and d the shift.
+    let senders = planar_poses(ego_from_cav)?.f_to_device(deltas.device())?.f_narrow(1, 0, 2)?;
+    // p_map = v + R^T (p_ego - v - d), with v the sender's position and d the shift.
     let moved = senders.f_constant_pad_nd([0, 1])? + deltas;
     places(&moved, &senders, [area, area], size)
 }
 
-/// Where the cells of the ego's lattice, that of `area`, lie on maps that are still where they were made, on `own`, given that
-/// their senders are `deltas` `[N, 3]` from where they say: `[N, H, W, 2]`.
+/// Positions of the ego's cells, on the grid of `area`, on maps in the frames of their senders, on `own`, given offsets
+/// `deltas` `[N, 3]` of the senders from their reported poses: `[N, H, W, 2]`.
 pub(crate) fn own_lattice(deltas: &Tensor, ego_from_cav: &[Pose], [area, own]: [&Area; 2]) -> Result<Tensor, TchError> {
-    let moved = said(ego_from_cav)?.f_to_device(deltas.device())? + deltas;
+    let moved = planar_poses(ego_from_cav)?.f_to_device(deltas.device())? + deltas;
     // p_cav = R^T (p_ego - v - d).
     places(&moved, &moved.f_narrow(1, 0, 2)?.f_zeros_like()?, [area, own], area.size)
 }
 
 /// `[N, 3]`: x and y, metres, and yaw, radians.
-fn said(ego_from_cav: &[Pose]) -> Result<Tensor, TchError> {
+fn planar_poses(ego_from_cav: &[Pose]) -> Result<Tensor, TchError> {
     let of_pose = |pose: &Pose| [pose.translation_m[0] as f32, pose.translation_m[1] as f32, pose.yaw_rad() as f32];
     let values: Vec<f32> = ego_from_cav.iter().flat_map(of_pose).collect();
     Tensor::f_from_slice(&values)?.f_view([-1, 3])
 }
 
-/// Where the cells of a lattice over `area` lie on lattices over `on`, given where on `area` lies, and how it is turned there,
-/// `[N, 3]`, what lies at `origin` `[N, 2]` on those: `[N, H, W, 2]`.
+/// Positions of the cells of a grid over `area` on grids over `on`, given the position and rotation on `area`,
+/// `[N, 3]`, of the point that is at `origin` `[N, 2]` on those: `[N, H, W, 2]`.
 fn places(pose: &Tensor, origin: &Tensor, [area, on]: [&Area; 2], size: [i64; 2]) -> Result<Tensor, TchError> {
     let yaw = pose.f_select(1, 2)?;
     let (cos, sin) = (yaw.f_cos()?, yaw.f_sin()?);
@@ -117,14 +118,14 @@ fn places(pose: &Tensor, origin: &Tensor, [area, on]: [&Area; 2], size: [i64; 2]
     Tensor::f_affine_grid_generator(&affine, [pose.size2()?.0, 1, size[0], size[1]], false)
 }
 
-/// Where a vehicle was by a `delta`, see [`lattice`].
+/// A sender's pose corrected by a `delta`, see [`lattice`].
 pub(crate) fn moved(ego_from_cav: &Pose, delta: &[f64]) -> Pose {
     let [x, y, z] = ego_from_cav.translation_m;
     Pose::from_xyz_yaw([x + delta[0], y + delta[1], z], ego_from_cav.yaw_rad() + delta[2])
 }
 
-/// Maps `[N, C, H, W]` and what is valid of them `[N, 1, H, W]`, read at `lattice`. Nothing is valid beyond their edges; maps
-/// are not zero where nothing is valid.
+/// Maps `[N, C, H, W]` and their validity `[N, 1, H, W]`, sampled at `lattice`. Cells beyond their edges are invalid;
+/// the values of invalid cells are not zero.
 pub(crate) fn resample(maps: &Tensor, valid: &Tensor, lattice: &Tensor) -> Result<(Tensor, Tensor), TchError> {
     let valid = valid.f_grid_sampler(&lattice.f_detach()?, NEAREST, PADDING_ZEROS, false)?.f_to_kind(Kind::Float)?;
     Ok((maps.f_grid_sampler(lattice, BILINEAR, PADDING_ZEROS, false)?, valid))
@@ -154,7 +155,7 @@ mod tests {
     #[test]
     fn a_delta_moves_a_map_as_a_pose_would() {
         let maps = Tensor::randn([1, 2, 16, 32], FLOAT);
-        // A vehicle at the ego's own place: turning about it and then shifting is a pose.
+        // A vehicle at the ego's own position: rotation about it and then a shift is a pose.
         let by_pose = warp_to_ego(&maps, None, &[Pose::from_xyz_yaw([1.0, -0.5, 0.0], 0.1)], &GRID).unwrap();
         let by_delta = map_moved(&maps, [1.0, -0.5, 0.1], Pose::IDENTITY);
         let inside = |map: &Tensor| map.narrow(2, 4, 8).narrow(3, 8, 16);
@@ -162,12 +163,12 @@ mod tests {
     }
 
     #[test]
-    fn a_map_read_where_it_was_made_is_one_warped_by_the_right_pose() {
+    fn a_map_sampled_as_received_equals_one_warped_by_the_right_pose() {
         let maps = uniform(3, &[1, 2, 16, 32]);
         let (pose, delta) = (Pose::from_xyz_yaw([2.3, -1.2, 0.0], 0.7), [0.8, -0.3, 0.1]);
         let by_pose = warp_to_ego(&maps, None, &[moved(&pose, &delta)], &GRID).unwrap();
         let deltas = Tensor::from_slice(&delta).to_kind(Kind::Float).view([1, 3]);
-        // Rows and columns that were padded on show what the ego's do, and more.
+        // Padded rows and columns contain the ego's cells, and more.
         let padded = Area::new(&GRID, [20, 40], 4);
         let places = own_lattice(&deltas, &[pose], [&padded, &area()]).unwrap();
         let (read, valid) = resample(&maps, &Tensor::ones([1, 1, 16, 32], FLOAT), &places).unwrap();

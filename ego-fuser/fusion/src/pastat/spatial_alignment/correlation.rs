@@ -1,43 +1,43 @@
-//! How well a neighbour's map fits the ego's when it is shifted, part by part of the lattice.
+//! Correlation of a neighbour's feature map with the ego's at every shift, part by part of the BEV grid.
 
 use tch::{Kind, TchError, Tensor};
 
-/// Parts of the lattice along each edge: enough to tell a turn from a shift.
+/// Parts of the grid along each edge: enough to distinguish a rotation from a shift.
 pub(crate) const PARTS: i64 = 4;
-/// Keeps the length of an empty part from being divided by.
+/// Prevents division by the norm of an empty part.
 const EPSILON: f64 = 1e-6;
 
-/// How alike maps are, by shift.
+/// Similarity of maps, by shift.
 pub(crate) struct Correlation {
     /// `[parts^2, N, K]`: -1..1, of each part.
     pub parts: Tensor,
-    /// `[parts^2, N]`: how much there is to see in both maps.
+    /// `[parts^2, N]`: signal energy in both maps.
     pub energy: Tensor,
-    /// `[N, K]`: of the whole lattice.
+    /// `[N, K]`: of the whole grid.
     pub whole: Tensor,
 }
 
-/// The shifts in the order of [`Correlation`], `[K, 2]`: cells along x and y that lead from a cell of a neighbour's map to
-/// the cell of the ego's that it is compared with.
+/// The shifts in the order of [`Correlation`], `[K, 2]`: cells along x and y from a cell of a neighbour's map to the
+/// cell of the ego's that it is compared with.
 pub(crate) fn shifts(radius: i64) -> Result<Tensor, TchError> {
     let steps = || -radius..=radius;
     let all: Vec<f32> = steps().flat_map(|row| steps().flat_map(move |column| [column as f32, row as f32])).collect();
     Tensor::f_from_slice(&all)?.f_view([-1, 2])
 }
 
-/// The ego's map at every shift, part by part: made once for all that is compared with it.
+/// The ego's map at every shift, part by part: computed once for all comparisons.
 #[derive(Debug)]
 pub(crate) struct Shifted {
     /// `[parts^2, K, M * H/parts * W/parts]`.
     maps: Tensor,
-    /// `[parts^2]`: sums of the squares of the map where it is.
+    /// `[parts^2]`: sums of the squares of the unshifted map.
     squares: Tensor,
     parts: i64,
 }
 
 impl Shifted {
-    /// `ego` `[1, M, H, W]`, `H` and `W` multiples of `parts`, moved by up to `radius` cells, in `parts` parts along each
-    /// edge. No gradient flows into it: what it is compared with learns the same.
+    /// `ego` `[1, M, H, W]`, `H` and `W` multiples of `parts`, moved by up to `radius` cells, in `parts` parts along
+    /// each edge. No gradient flows into it: the same layers learn from the other map.
     pub(crate) fn new(ego: &Tensor, radius: i64, parts: i64) -> Result<Self, TchError> {
         let (_, channels, height, width) = ego.size4()?;
         let (rows, columns, edge) = (height / parts, width / parts, 2 * radius + 1);
@@ -75,7 +75,8 @@ impl Shifted {
     }
 }
 
-/// The shift at which correlations `[.., K]` are highest, `[.., 2]`, as a mean weighted by `exp(sharpness * correlation)`.
+/// The shift at which correlations `[.., K]` are highest, `[.., 2]`, as a mean weighted by
+/// `exp(sharpness * correlation)`.
 pub(crate) fn peaks(correlation: &Tensor, sharpness: &Tensor, shifts: &Tensor) -> Result<Tensor, TchError> {
     (correlation * sharpness).f_softmax(-1, None)?.f_matmul(shifts)
 }
@@ -101,7 +102,7 @@ mod tests {
             (at(0) + 2.0).abs() < 0.05 && (at(1) - 1.0).abs() < 0.05
         };
         assert!(near(&whole, &[0]), "{whole}");
-        // Part 5 lies inside, where nothing has come around the edges.
+        // Part 5 lies inside, where nothing wraps around the edges.
         assert!(near(&parts, &[5, 0]), "{parts}");
         assert!(found.parts.abs().max().double_value(&[]) < 1.5);
     }

@@ -1,7 +1,7 @@
-//! FSA, Feature Spatial Alignment: corrects where poses have put maps, by what the maps show.
+//! FSA, Feature Spatial Alignment: corrects the pose-based alignment of maps by their content.
 //!
-//! Every map but the ego's newest is compared with that. The network predicts `(dx, dy, theta)` per map; the map and its tokens
-//! are moved by it, and the tokens get how well the map fits. Identity before it is trained.
+//! Every map is compared with the ego's newest. The network predicts `(dx, dy, theta)` per map; the map and its tokens
+//! are moved by it, and the tokens get the quality of the match. Identity before training.
 
 pub(super) mod area;
 pub(super) mod correlation;
@@ -27,7 +27,7 @@ use crate::warp::WarpedMaps;
 /// Feature Spatial Alignment.
 #[derive(Debug)]
 pub(super) struct SpatialAlignment {
-    /// Absent, maps stay where poses put them, for the ablation.
+    /// Absent: maps are aligned by their poses only, for the ablation.
     network: Option<AlignmentNetwork>,
     search: AlignmentSearch,
     /// Cells along each edge of a cell of earlier maps.
@@ -40,7 +40,7 @@ pub(super) struct FineMaps {
     pub(super) own: Tensor,
     /// The newest maps of all others.
     pub(super) neighbours: NeighbourMaps,
-    /// `[N - 1, 3]`: corrections of all entries but the ego's newest, metres and radians; absent: none was looked for.
+    /// `[N - 1, 3]`: corrections of all entries but the ego's newest, metres and radians; absent: none were estimated.
     pub(super) corrections: Option<Tensor>,
 }
 
@@ -50,7 +50,7 @@ pub(super) struct AlignedTokens {
     pub(super) values: Tensor,
     /// `[N, h, w]`.
     pub(super) valid: Tensor,
-    /// `[N, D]`: how well each map fits; absent: not known.
+    /// `[N, D]`: quality of each map's match; absent: not known.
     pub(super) fit: Option<Tensor>,
 }
 
@@ -65,7 +65,7 @@ impl SpatialAlignment {
         }
     }
 
-    /// Moves all entries but the ego's newest to where they fit that; `is_training`: by the network alone.
+    /// Moves all entries but the ego's newest to their best match with that; `is_training`: by the network only.
     pub(super) fn align(
         &self,
         coarse: &CoarseMaps,
@@ -86,7 +86,7 @@ impl SpatialAlignment {
             self.compare(network, coarse, &confidences.of_maps, &area, is_training)?;
         let (values, valid) = moved_tokens(&values, &valid, &deltas, &coarse.origins, &area)?;
         let neighbours = moved_maps(coarse, &deltas, &area, grid)?;
-        // The ego's newest, which fits itself, gets nothing.
+        // The ego's newest, which matches itself, gets nothing.
         let fit = Some(fit.f_constant_pad_nd([0, 0, 1, 0])?);
         Ok((FineMaps { own, neighbours, corrections: Some(deltas) }, AlignedTokens { values, valid, fit }))
     }
@@ -121,7 +121,7 @@ impl SpatialAlignment {
     }
 }
 
-/// Tokens `[N, D, h, w]` and which of them count `[N, h, w]`, all but the first entry's moved by `deltas` `[N - 1, 3]`.
+/// Tokens `[N, D, h, w]` and their validity `[N, h, w]`, all but the first entry's moved by `deltas` `[N - 1, 3]`.
 fn moved_tokens(
     values: &Tensor,
     valid: &Tensor,
@@ -137,7 +137,7 @@ fn moved_tokens(
     Ok((with_first(values, after)?, with_first(valid, after_valid.f_squeeze_dim(1)?)?))
 }
 
-/// The newest maps of neighbours, sampled from the maps as received by the poses that `deltas` correct.
+/// The newest maps of neighbours, resampled from the maps as received by the poses that `deltas` correct.
 fn moved_maps(coarse: &CoarseMaps, deltas: &Tensor, area: &Area, grid: &BevGrid) -> Result<NeighbourMaps, TchError> {
     let count = coarse.newest.count()? - 1;
     if count == 0 {

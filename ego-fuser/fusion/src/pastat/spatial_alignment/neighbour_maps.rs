@@ -6,34 +6,34 @@ use super::area::resample;
 use crate::f64_tensor::{self, are_numbers};
 use crate::warp::{Cells, WarpedMaps};
 
-/// Maps on the ego's grid. Where FSA has corrected their poses they are sampled anew from the maps as received: sampling what was
-/// sampled before would blur it, and what a wrong pose has put beyond the ego's edges would be lost. Where no gradient flows that
-/// is done when the maximum over them is taken, once and cell by cell.
+/// Maps on the ego's grid. Maps with corrected poses are resampled from the maps as received: a second resampling would
+/// blur them, and cells that a wrong pose has put beyond the ego's edges would be lost. Where no gradient flows this is
+/// done when the maximum over them is taken, once and cell by cell.
 pub(crate) struct NeighbourMaps {
     maps: WarpedMaps,
-    /// `[M, H, W, 2]`: where on the maps the ego's cells lie, for `grid_sampler`; absent: maps lie where they belong.
+    /// `[M, H, W, 2]`: positions of the ego's cells on the maps, for `grid_sampler`; absent: maps are aligned already.
     places: Option<Tensor>,
 }
 
 impl NeighbourMaps {
-    /// Of maps that lie where they belong.
+    /// Of maps that are aligned already.
     pub(crate) fn still(maps: WarpedMaps) -> Self {
         Self { maps, places: None }
     }
 
-    /// How many.
+    /// Number of maps.
     pub(crate) fn count(&self) -> Result<i64, TchError> {
         self.maps.count()
     }
 
-    /// The maps, where they lie by now.
+    /// The maps after alignment.
     #[cfg(test)]
     pub(crate) fn maps(&self) -> &WarpedMaps {
         assert!(self.places.is_none(), "they are not read yet");
         &self.maps
     }
 
-    /// Of maps where they were made, to be read at `places`.
+    /// Of maps as received, to be sampled at `places`.
     pub(crate) fn at(maps: WarpedMaps, places: Tensor) -> Result<Self, TchError> {
         if are_numbers(&maps.features) && are_numbers(&places) {
             return Ok(Self { maps, places: Some(places) });
@@ -42,7 +42,8 @@ impl NeighbourMaps {
         Ok(Self::still(WarpedMaps { features, mask }))
     }
 
-    /// The maximum `[1, C, H, W]` of the ego's map `[C, H, W]` and these, times `weight` `[M, 1, H, W]`, where they reach.
+    /// The maximum `[1, C, H, W]` of the ego's map `[C, H, W]` and these, times `weight` `[M, 1, H, W]`, where they are
+    /// valid.
     pub(crate) fn maximum_with(&self, own: &Tensor, weight: &Tensor) -> Result<Tensor, TchError> {
         if let Some(places) = &self.places {
             let mut maximum = f64_tensor::cells(own)?;
@@ -53,7 +54,7 @@ impl NeighbourMaps {
             return Tensor::f_from_slice(&maximum)?.f_view([1, height, width, channels])?.f_permute([0, 3, 1, 2]);
         }
         let WarpedMaps { features, mask } = &self.maps;
-        // A map has no part out of its reach.
+        // A map contributes nothing out of its reach.
         let reach = mask.f_zeros_like()?.f_masked_fill(&mask.f_eq(0.0)?, f64::NEG_INFINITY)?;
         let mut maximum = own.shallow_clone();
         for index in 0..self.count()? {
@@ -63,7 +64,7 @@ impl NeighbourMaps {
         f64_tensor::by_cell(&maximum)
     }
 
-    /// Raises `maximum` `[H * W, C]` to what a map shows at `places`, times `shares` `[M, 1, H, W]`.
+    /// Raises `maximum` `[H * W, C]` to the values of a map at `places`, times `shares` `[M, 1, H, W]`.
     fn raise(&self, maximum: &mut [f32], map: i64, [places, shares]: [&Tensor; 2]) -> Result<(), TchError> {
         let of = |tensor: &Tensor| tensor.f_get(map);
         let [valid, shares] = [&self.maps.mask, shares].map(|tensor| of(tensor)?.f_squeeze_dim(0));
@@ -98,7 +99,7 @@ mod tests {
         };
         let (numbers, tensors) = (found(false), found(true));
         assert_ne!(numbers, own.unsqueeze(0));
-        // A place between two cells may be nearest to either.
+        // At a position between two cells either may be the nearest.
         let apart = (numbers - tensors).abs().gt(1e-4).sum(Kind::Int64).int64_value(&[]);
         assert!(apart <= 3, "{apart}");
     }

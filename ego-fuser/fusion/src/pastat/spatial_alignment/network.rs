@@ -14,36 +14,36 @@ use crate::pastat::confidence_embedding::CONFIDENCES;
 use crate::pastat::config::FsaConfig;
 use crate::warp::WarpedMaps;
 
-/// Keeps the weight of a map that fits nowhere from being divided by.
+/// Prevents division by the weight of a map that matches nowhere.
 const EPSILON: f64 = 1e-6;
-/// How sharply the best shift stands out before it is trained: correlations lie between -1 and 1.
+/// Initial sharpness of the softmax over shifts: correlations lie between -1 and 1.
 const SHARPNESS: f64 = 20.0;
-/// What is added to the lever arm of a turn, metres.
+/// Added to the lever arm of a rotation, metres.
 const ARM_M: f64 = 5.0;
 
-/// Predicts `(dx, dy, theta)` of every neighbour's map from what it shows and what the ego shows, and how much its pose
-/// is trusted: convolutions make both comparable, the shifts at which they fit best, part by part of the lattice, go
-/// through fully connected layers.
+/// Predicts `(dx, dy, theta)` of every neighbour's map from its content and the ego's, and the trust in its pose:
+/// convolutions make both comparable; the shifts with the best match, part by part of the grid, are the input of fully
+/// connected layers.
 #[derive(Debug)]
 pub(crate) struct AlignmentNetwork {
     config: FsaConfig,
     matching: [nn::Conv2D; 2],
-    /// How sharply the best shift stands out, its logarithm.
+    /// Logarithm of the sharpness of the softmax over shifts.
     sharpness: Tensor,
     hidden: nn::Linear,
-    /// What is added to the motion that fits the parts' shifts, and how much of that motion is taken.
+    /// Additive correction of the motion that fits the parts' shifts, and the share of that motion that is applied.
     delta: nn::Linear,
-    /// Part of the map's tokens: how well it fits.
+    /// Part of the map's tokens: quality of the match.
     fit: nn::Linear,
 }
 
 impl AlignmentNetwork {
-    /// Moves nothing and tells tokens of `dim` channels nothing before it is trained.
+    /// Before training it moves nothing and adds nothing to tokens of `dim` channels.
     pub(crate) fn new(path: &nn::Path<'_>, [channels, dim]: [i64; 2], config: &FsaConfig) -> Self {
         let FsaConfig { matching, hidden, .. } = *config;
         let still = nn::LinearConfig { ws_init: Init::Const(0.0), bs_init: Some(Init::Const(0.0)), bias: true };
         let around = nn::ConvConfig { padding: 1, ..Default::default() };
-        // Of each part the shift along x and y and how well it fits; the same of the whole; the motion; the confidences.
+        // For each part the shift along x and y and its quality; the same for the whole; the motion; the confidences.
         let inputs = 3 * (PARTS * PARTS + 1) + 3 + CONFIDENCES;
         Self {
             matching: [
@@ -58,17 +58,17 @@ impl AlignmentNetwork {
         }
     }
 
-    /// Cells are compared up to so many cells away.
+    /// Largest offset between compared cells, cells.
     pub(crate) fn radius(&self) -> i64 {
         self.config.radius
     }
 
-    /// The few channels in which maps are compared.
+    /// The reduced channels in which maps are compared.
     pub(crate) fn reduced(&self, WarpedMaps { features, mask }: &WarpedMaps) -> Result<WarpedMaps, TchError> {
         Ok(WarpedMaps { features: pointwise(&self.matching[0], features)?, mask: mask.shallow_clone() })
     }
 
-    /// `K` maps and the ego's, all [reduced](Self::reduced), as they are compared.
+    /// `K` maps and the ego's, all [reduced](Self::reduced), prepared for comparison.
     ///
     /// # Shapes
     /// - `maps`: 1 and `K` maps on the grid of `area`
@@ -92,7 +92,7 @@ impl AlignmentNetwork {
         })
     }
 
-    /// Compares maps where `deltas` `[K, 3]`, metres and radians in the ego's frame, put them; the displacements include those.
+    /// Compares maps at `deltas` `[K, 3]`, metres and radians in the ego's frame; the displacements include those.
     pub(crate) fn displacements(&self, pairs: &Pairs, deltas: &Tensor, area: &Area) -> Result<Displacements, TchError> {
         let Pairs { own, confidences, ego_from_cav, .. } = pairs;
         let device = deltas.device();
@@ -120,7 +120,8 @@ impl AlignmentNetwork {
         Ok(Displacements { deltas: near + deltas, fit: self.fit.forward(&hidden), similarity })
     }
 
-    /// `[K, 3]`: what is `learnt` `[K, 6]`, to be added and the share of the `motion` `[K, 3]`, within bounds.
+    /// `[K, 3]` from the network's output `learnt` `[K, 6]`, an addition and the share of the `motion` `[K, 3]`, within
+    /// bounds.
     fn bounded(&self, learnt: &Tensor, motion: Tensor) -> Result<Tensor, TchError> {
         let FsaConfig { max_shift_m, max_turn_rad, .. } = self.config;
         let bounds = Tensor::f_from_slice(&[max_shift_m as f32, max_shift_m as f32, max_turn_rad as f32])?;
@@ -129,7 +130,7 @@ impl AlignmentNetwork {
         Ok(raw.f_tanh()? * bounds)
     }
 
-    /// What is compared, `[N, M, H, W]`: zero in the mean of what a map shows, so that empty road fits nothing.
+    /// Compared form of maps, `[N, M, H, W]`: zero mean over the valid cells, so that empty road matches nothing.
     fn shown(&self, WarpedMaps { features, mask }: &WarpedMaps) -> Result<Tensor, TchError> {
         let shown = self.matching[1].forward(&features.f_relu()?);
         let over_map = |tensor: &Tensor| tensor.f_sum_dim_intlist([2_i64, 3].as_slice(), true, None);
@@ -138,7 +139,7 @@ impl AlignmentNetwork {
     }
 }
 
-/// What is compared of others, moved by `deltas` `[K, 3]`.
+/// Compared form of others, moved by `deltas` `[K, 3]`.
 fn moved(Pairs { shown, mask, ego_from_cav, .. }: &Pairs, deltas: &Tensor, area: &Area) -> Result<Tensor, TchError> {
     if deltas.f_count_nonzero(None::<i64>)?.f_int64_value(&[])? == 0 {
         return Ok(shown.shallow_clone());
@@ -149,27 +150,28 @@ fn moved(Pairs { shown, mask, ego_from_cav, .. }: &Pairs, deltas: &Tensor, area:
     moved.f_mul(&valid)
 }
 
-/// The motion that fits the shifts of the parts best, `[N, 3]`: a shift, metres, after a small turn about the sender, radians.
+/// The motion that fits the shifts of the parts best, `[N, 3]`: a shift, metres, after a small rotation about the
+/// sender, radians.
 ///
 /// # Shapes
 /// - `parts`: `[PARTS^2, N, 2]` shifts, metres
-/// - `weight`: `[PARTS^2, N]` how sure each of them is
-/// - `senders`: `[N, 2]`, where the maps' senders are, metres from the middle of `area`
+/// - `weight`: `[PARTS^2, N]`, confidence of each of them
+/// - `senders`: `[N, 2]`, positions of the maps' senders, metres from the centre of `area`
 fn rigid_motion(parts: &Tensor, weight: &Tensor, senders: &Tensor, area: &Area) -> Result<Tensor, TchError> {
     let over_parts = |tensor: &Tensor| tensor.f_sum_dim_intlist([0_i64].as_slice(), false, None);
     let share = weight / over_parts(weight)?.f_add_scalar(EPSILON)?;
     let share = share.f_unsqueeze(2)?;
-    // Middles of the parts, from the middle of the lattice.
+    // Centres of the parts, from the centre of the grid.
     let middles = area.middles_of_parts()?.f_to_device(parts.device())?.f_unsqueeze(1)?;
     let (mean, middle) = (over_parts(&(parts * &share))?, over_parts(&(&middles * &share))?);
     let (shift, arm) = (parts - mean.f_unsqueeze(0)?, &middles - middle.f_unsqueeze(0)?);
     let column = |tensor: &Tensor, axis: i64| tensor.f_narrow(2, axis, 1);
     let turning = column(&arm, 0)? * column(&shift, 1)? - column(&arm, 1)? * column(&shift, 0)?;
     let inertia = over_parts(&(arm.f_square()?.f_sum_dim_intlist([2_i64].as_slice(), true, None)? * &share))?;
-    // A single part says nothing of a turn: a few metres keep that from being divided by.
+    // A single part does not determine a rotation: a few metres of lever arm prevent division by zero.
     let turn = over_parts(&(turning * &share))? / inertia.f_add_scalar(ARM_M * ARM_M)?;
     let to_sender = senders - middle;
-    // The middle of what was seen moves by `mean`; a turn moves the sender beside it.
+    // The weighted centre of the observed parts moves by `mean`; a rotation moves the sender relative to it.
     let across = Tensor::f_cat(&[-(to_sender.f_narrow(1, 1, 1)?), to_sender.f_narrow(1, 0, 1)?], 1)?;
     Tensor::f_cat(&[mean + across * &turn, turn], 1)
 }
@@ -189,7 +191,7 @@ mod tests {
         Area::new(&GRID, [16, 32], 4)
     }
 
-    /// Without the search, in which maps without a meaning fit anywhere.
+    /// Without the search, in which random maps match anywhere.
     fn near() -> FsaConfig {
         FsaConfig { alignment_search: None, ..FsaConfig::default() }
     }
@@ -209,8 +211,8 @@ mod tests {
         let variables = VarStore::new(Device::Cpu);
         let fsa = AlignmentNetwork::new(&variables.root(), [4, 6], &near());
         let poses = [Pose::from_xyz_yaw([3.0, 1.0, 0.0], 0.3), Pose::IDENTITY];
-        let look = |maps: &WarpedMaps| fsa.reduced(maps).unwrap();
-        let maps = [&look(&random(1)), &look(&random(2))];
+        let reduce = |maps: &WarpedMaps| fsa.reduced(maps).unwrap();
+        let maps = [&reduce(&random(1)), &reduce(&random(2))];
         let found = compared(&fsa, maps, &poses);
         assert_eq!(found.fit, Tensor::zeros([2, 6], FLOAT));
         let deltas = found.deltas;
@@ -231,8 +233,8 @@ mod tests {
         let config = near();
         let fsa = AlignmentNetwork::new(&variables.root(), [4, 6], &config);
         let _ = tch::no_grad(|| variables.variables()["delta.bias"].shallow_clone().fill_(1e6));
-        let look = |maps: &WarpedMaps| fsa.reduced(maps).unwrap();
-        let deltas = compared(&fsa, [&look(&random(1)), &look(&random(1))], &[Pose::IDENTITY]).deltas;
+        let reduce = |maps: &WarpedMaps| fsa.reduced(maps).unwrap();
+        let deltas = compared(&fsa, [&reduce(&random(1)), &reduce(&random(1))], &[Pose::IDENTITY]).deltas;
         let found = Vec::<f32>::try_from(deltas.view(-1)).unwrap();
         assert!((found[0] - 3.0).abs() < 1e-6 && (f64::from(found[2]) - config.max_turn_rad).abs() < 1e-6);
     }
@@ -242,7 +244,7 @@ mod tests {
         let sender = Pose::from_xyz_yaw([3.0, -1.0, 0.0], 0.4);
         let (turn, shift) = (0.02_f64, [0.7, -0.3]);
         let (middles, senders) = (area().middles_of_parts().unwrap(), area().places_of(&[sender]).unwrap());
-        // Each part moves by the shift, and by the turn about the sender.
+        // Each part moves by the shift, and by the rotation about the sender.
         let parts: Vec<f32> = (0..PARTS * PARTS)
             .flat_map(|part| {
                 let [x, y] = [0, 1].map(|axis| middles.double_value(&[part, axis]) - senders.double_value(&[0, axis]));
@@ -252,7 +254,7 @@ mod tests {
         let parts = Tensor::from_slice(&parts).view([-1, 1, 2]);
         let motion = rigid_motion(&parts, &Tensor::ones([PARTS * PARTS, 1], FLOAT), &senders, &area()).unwrap();
         let [dx, dy, theta] = [0, 1, 2].map(|index| motion.double_value(&[0, index]));
-        // The turn comes out smaller by the arm that is added, and the shift by what that turn moves the sender.
+        // The rotation is underestimated by the added arm, and the shift by the corresponding move of the sender.
         assert!(theta > 0.4 * turn && theta <= turn, "{theta}");
         assert!((dx - shift[0]).abs() < 0.05 && (dy - shift[1]).abs() < 0.05, "{dx} {dy}");
     }

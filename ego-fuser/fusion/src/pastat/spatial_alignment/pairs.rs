@@ -7,20 +7,20 @@ use tch::{TchError, Tensor};
 
 use super::correlation::Shifted;
 
-/// The ego's map and `K` others, as they are compared.
+/// The ego's map and `K` others, prepared for comparison.
 #[derive(Debug)]
 pub(crate) struct Pairs {
     /// `[1, M, H, W]`: the ego's map.
     pub(crate) ego: Tensor,
     /// The same at every shift.
     pub(crate) own: Rc<Shifted>,
-    /// `[K, M, H, W]`, where their poses put them.
+    /// `[K, M, H, W]`, at their poses.
     pub(crate) shown: Tensor,
-    /// `[K, 1, H, W]`, 1 where they show something.
+    /// `[K, 1, H, W]`, 1 where they are valid.
     pub(crate) mask: Tensor,
     /// `[K, CONFIDENCES]` of their poses.
     pub(crate) confidences: Tensor,
-    /// Where their senders say that they were.
+    /// Poses that their senders reported.
     pub(crate) ego_from_cav: Vec<Pose>,
 }
 
@@ -43,14 +43,14 @@ impl Pairs {
 pub(crate) struct Displacements {
     /// `[K, 3]`: shift along x and y of the ego in metres, turn about the sender in radians.
     pub(crate) deltas: Tensor,
-    /// `[K, D]`: how well each map fits, as a part of its tokens. A map that fits nowhere is of a sender with a wrong pose.
+    /// `[K, D]`: quality of each map's match, as a part of its tokens. A map that matches nowhere has a wrong pose.
     pub(crate) fit: Tensor,
-    /// `[K]`: the correlation of the whole map with the ego's, where it is highest.
+    /// `[K]`: the highest correlation of the whole map with the ego's.
     pub(crate) similarity: Tensor,
 }
 
 impl Displacements {
-    /// Those of several comparisons, one after another.
+    /// Concatenation of several comparisons.
     pub(crate) fn all(several: &[Self]) -> Result<Self, TchError> {
         let cat = |of: fn(&Self) -> &Tensor| Tensor::f_cat(&several.iter().map(of).collect::<Vec<_>>(), 0);
         Ok(Self {
@@ -60,7 +60,7 @@ impl Displacements {
         })
     }
 
-    /// Those of some maps.
+    /// Rows of some maps.
     pub(crate) fn only(&self, rows: &[i64]) -> Result<Self, TchError> {
         Ok(Self {
             deltas: picked(&self.deltas, rows)?,
@@ -69,7 +69,7 @@ impl Displacements {
         })
     }
 
-    /// The same with those of another comparison for the maps in `rows`.
+    /// The same with rows of another comparison for the maps in `rows`.
     pub(crate) fn with(&self, rows: &[i64], other: &Self) -> Result<Self, TchError> {
         let index = Tensor::f_from_slice(rows)?.f_to_device(self.deltas.device())?;
         let with = |of: fn(&Self) -> &Tensor| of(self).f_index_copy(0, &index, of(other));

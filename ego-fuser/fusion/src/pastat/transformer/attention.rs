@@ -6,7 +6,7 @@ use tch::{Kind, TchError, Tensor};
 use crate::f64_tensor::numbers;
 use crate::pastat::extensions::ego_queries::Others;
 
-/// What a masked score is set to: low enough for no weight, and finite, so that rows with nothing valid stay numbers.
+/// Score of masked tokens: low enough for zero weight, and finite, so that rows without valid tokens stay finite.
 const MASKED: f64 = -1e9;
 
 /// Multi-head self-attention over agents and time at each cell (the MSA of Eq. 8).
@@ -16,8 +16,8 @@ pub(super) struct AgentAttention {
     key: nn::Linear,
     value: nn::Linear,
     out: nn::Linear,
-    /// `[D, heads]`, 1 where a channel is of a head: sums over a head's channels are products with it, and so are copies of
-    /// a head's weight to its channels; both cost less than sums and products of many small rows.
+    /// `[D, heads]`, 1 where a channel belongs to a head: sums over a head's channels are products with it, and so are
+    /// copies of a head's weight to its channels; both cost less than sums and products of many small rows.
     members: Tensor,
     heads: i64,
 }
@@ -35,11 +35,11 @@ impl AgentAttention {
         }
     }
 
-    /// What the first `rows` entries learn of all, at each cell.
+    /// Attention of the first `rows` entries to all, at each cell.
     ///
     /// # Shapes
     /// - `tokens`: `[N, h, w, D]`
-    /// - `valid`: `[N, h, w]`, 1 for tokens that count
+    /// - `valid`: `[N, h, w]`, 1 for valid tokens
     /// - returns: `[rows, h, w, D]`
     pub(super) fn forward(&self, tokens: &Tensor, valid: &Tensor, rows: i64) -> Result<Tensor, TchError> {
         let (entries, height, width, dim) = tokens.size4()?;
@@ -57,10 +57,10 @@ impl AgentAttention {
         Ok(self.out.forward(&mixed.f_reshape([rows, height, width, dim])?))
     }
 
-    /// What the ego learns of all, from tokens that are not normalised yet: the same as `forward` of one row.
+    /// Attention of the ego to all, from tokens that are not normalised yet: the same as `forward` of one row.
     ///
     /// A head's score of a token is the product of its query, led back through the weights of keys and norm, with the
-    /// token; what the norm adds to all tokens alike changes no weight. So neither keys nor values are made of tokens.
+    /// token; the constant term of the norm changes no weight. So neither keys nor values are computed.
     ///
     /// # Shapes
     /// - `ego`, returns: `[1, h, w, D]`
@@ -82,7 +82,7 @@ impl AgentAttention {
         Ok(self.out.forward(&mixed.f_view([dim, cells])?.f_transpose(0, 1)?.f_reshape([1, height, width, dim])?))
     }
 
-    /// Only the ego asks: sums over few entries, cheaper than products of small matrices.
+    /// One query row, the ego's: sums over few entries are cheaper than products of small matrices.
     fn one_row(&self, query: &Tensor, key: &Tensor, value: &Tensor, hidden: &Tensor) -> Result<Tensor, TchError> {
         let scores = (query * key).f_matmul(&self.members)?;
         let weights = scores.f_masked_fill(hidden, MASKED)?.f_softmax(0, None)?;
@@ -112,9 +112,9 @@ pub(super) struct WindowAttention {
 #[derive(Debug)]
 struct WindowSize {
     edge: i64,
-    /// `[(2 edge - 1)^2, heads]`: a learnt preference for each relative place.
+    /// `[(2 edge - 1)^2, heads]`: a learnt bias for each relative position.
     bias: Tensor,
-    /// `[edge^4]`: the relative place of each pair.
+    /// `[edge^4]`: the relative position of each pair.
     places: Vec<i64>,
 }
 
@@ -135,11 +135,11 @@ impl WindowAttention {
         }
     }
 
-    /// What each token learns of its windows.
+    /// Attention of each token within its windows.
     ///
     /// # Shapes
     /// - `tokens`: `[N, h, w, D]`, `h` and `w` multiples of every window
-    /// - `valid`: `[N, h, w]`, 1 for tokens that count
+    /// - `valid`: `[N, h, w]`, 1 for valid tokens
     /// - returns: `[N, h, w, D]`
     pub(super) fn forward(&self, tokens: &Tensor, valid: &Tensor) -> Result<Tensor, TchError> {
         let (.., dim) = tokens.size4()?;
@@ -183,7 +183,7 @@ impl WindowAttention {
     }
 }
 
-/// For each pair of tokens of a window, which row of the table of preferences is theirs.
+/// Row of the bias table for each pair of tokens of a window.
 fn relative_places(edge: i64) -> Vec<i64> {
     let tokens = || (0..edge).flat_map(move |row| (0..edge).map(move |column| (row, column)));
     let place = |(a_row, a_column): (i64, i64), (b_row, b_column): (i64, i64)| {
@@ -223,7 +223,7 @@ mod tests {
         // More cells than a strip, and a rest.
         let tokens = uniform(1, &[4, 9, 10, 12]) * 3.0;
         let valid = uniform(2, &[4, 9, 10]).gt(0.4).to_kind(Kind::Float);
-        // There nothing counts.
+        // No valid tokens here.
         let _ = valid.select(1, 0).select(1, 0).fill_(0.0);
         let forward = attention.forward(&norm.forward(&tokens), &valid, 1).unwrap();
         let others = Others::of(&tokens.permute([0, 3, 1, 2]), &valid).unwrap();
@@ -232,7 +232,7 @@ mod tests {
     }
 
     #[test]
-    fn hidden_tokens_are_not_looked_at() {
+    fn hidden_tokens_are_not_attended_to() {
         let variables = VarStore::new(Device::Cpu);
         let agents = AgentAttention::new(&(variables.root() / "a"), 8, 2);
         let windows = WindowAttention::new(&(variables.root() / "w"), 8, 2, &[2, 4]);

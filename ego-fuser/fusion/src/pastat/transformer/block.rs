@@ -41,13 +41,14 @@ impl Block {
         self.across(&kept, &valid.f_narrow(0, 0, rows)?)
     }
 
-    /// The ego's newest `[1, h, w, D]` after this block, in numbers: the same as the first row of [`forward`](Self::forward).
+    /// The ego's newest `[1, h, w, D]` after this block, in plain floats: the same as the first row of
+    /// [`forward`](Self::forward).
     pub(super) fn gather(&self, ego: &Tensor, others: &Others, valid: &Tensor) -> Result<Tensor, TchError> {
         let kept = self.agents.gather(&self.norms[0], ego, others)? + ego;
         self.across(&kept, valid)
     }
 
-    /// What is left when each entry has learnt of the others: across cells, and cell by cell.
+    /// Second half of the block, after the attention over agents and time: across cells, and cell by cell.
     fn across(&self, kept: &Tensor, valid: &Tensor) -> Result<Tensor, TchError> {
         let [_, norm_windows, norm_mlp] = &self.norms;
         let kept = self.windows.forward(&norm_windows.forward(kept), valid)? + kept;

@@ -1,7 +1,8 @@
-//! Vision transformer (Eq. 8, 9): attention over agents and time at each cell and within windows, then an MLP, in pre-norm blocks.
+//! Vision transformer (Eq. 8, 9): attention over agents and time at each cell and within windows, then an MLP, in
+//! pre-norm blocks.
 //!
-//! Full attention over all cells of all maps is out of reach. As in V2X-ViT, tokens attend over agents and time at each cell, and
-//! across cells within windows of several sizes.
+//! Full attention over all cells of all maps is too expensive. As in V2X-ViT, tokens attend over agents and time at
+//! each cell, and across cells within windows of several sizes.
 
 mod attention;
 mod block;

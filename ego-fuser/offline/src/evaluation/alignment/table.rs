@@ -13,7 +13,7 @@ use super::{AlignmentError, PairOutcome};
 pub struct Row {
     /// Name of the method.
     pub method: String,
-    /// Pairs of ego and neighbour, every moment anew.
+    /// Pairs of ego and neighbour, counted at every tick.
     pub pairs: usize,
     /// Mean time per pair, seconds.
     pub time_s: f64,
@@ -25,13 +25,13 @@ pub struct Row {
     pub success_3m: f64,
     /// The same within 1 m.
     pub success_1m: f64,
-    /// Mean error of the pairs that were aligned, metres; `None` where none was.
+    /// Mean error of the aligned pairs, metres; `None` where none was aligned.
     pub mean_m: Option<f64>,
-    /// Median of the same.
+    /// Median of the same, metres.
     pub p50_m: Option<f64>,
-    /// Mean error of the pairs that were aligned, degrees.
+    /// Mean error of the aligned pairs, degrees.
     pub mean_deg: Option<f64>,
-    /// Median of the same.
+    /// Median of the same, degrees.
     pub p50_deg: Option<f64>,
     /// Share of all pairs that were not aligned, 0..1.
     pub not_aligned: f64,

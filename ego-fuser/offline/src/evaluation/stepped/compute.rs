@@ -1,4 +1,4 @@
-//! How long the computers of a fleet take, in virtual time.
+//! Compute times of a fleet's processes, in simulation time.
 
 use std::time::{Duration, Instant};
 
@@ -44,12 +44,12 @@ impl ComputeTimes {
         nanos::of_ms(self.fuse_ms)
     }
 
-    /// Until an agent has published everything of a sweep.
+    /// Time until an agent has published all messages of a sweep.
     pub(super) fn agent_nanos(&self) -> u64 {
         self.pose_nanos().saturating_add(self.map_nanos())
     }
 
-    /// Virtual computers take every sweep: whoever cannot keep up would have to leave some out, and is refused.
+    /// In simulation time every sweep is processed: a process that is slower than the scene is rejected.
     pub(super) fn check(&self, scenario: &Scenario) -> Result<(), EvaluateError> {
         let steps = scenario.ticks.windows(2).map(|pair| pair[1].capture_nanos.saturating_sub(pair[0].capture_nanos));
         let Some(period_nanos) = steps.min() else { return Ok(()) };
@@ -65,8 +65,8 @@ impl ComputeTimes {
 }
 
 impl Evaluator {
-    /// Measures the first ticks of a scenario on this machine: medians, rounded up to whole milliseconds. Written into a
-    /// scenario they make its run repeatable.
+    /// Measures the first ticks of a scenario on this machine: medians, rounded up to whole milliseconds. In a scenario
+    /// file they make its run repeatable.
     ///
     /// # Errors
     /// [`EvaluateError`] when a frame cannot be read or computed.

@@ -1,5 +1,5 @@
-//! Messages between the agents and an ego in virtual time: handed over ahead, offered to the air in the order of time,
-//! and booked.
+//! Delayed delivery: messages between the agents and an ego in simulation time, handed over ahead, offered to the link
+//! in order of time, and counted.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -14,49 +14,49 @@ use ego_fuser::ego::View;
 pub(super) struct Envelope {
     pub(super) view: View,
     pub(super) payload_bytes: u64,
-    /// Headers and the pose's own message included.
+    /// Headers and the pose message included.
     pub(super) wire_bytes: u64,
 }
 
-/// A message that has come.
+/// A message that has arrived.
 pub(super) struct Arrived {
-    /// When, on the scene's clock.
+    /// Arrival on the scene's clock, nanoseconds.
     pub(super) nanos: u64,
-    pub(super) letter: Envelope,
+    pub(super) envelope: Envelope,
 }
 
-/// A message that was handed over; of a pose nothing is of use but its bytes.
+/// A message that was handed over; of a pose only the size is needed.
 struct Kept {
     topic: Topic,
-    letter: Option<Envelope>,
+    envelope: Option<Envelope>,
 }
 
-/// Carries what neighbours send to the ego.
+/// Delivers the neighbours' messages to the ego.
 pub(super) struct DelayedDelivery {
-    air: LinkEmulator,
+    link: LinkEmulator,
     ego: CavId,
     receiver: ProcessId,
-    /// Time 0 of the air on the scene's clock.
+    /// Time 0 of the link on the scene's clock.
     began_nanos: u64,
-    /// What will be offered, by time and number.
-    posted: BTreeMap<(u64, u64), Packet>,
-    /// What was handed over and has not come to its end.
+    /// Messages to be offered, by time and number.
+    pending: BTreeMap<(u64, u64), Packet>,
+    /// Messages that were handed over and neither arrived nor were lost yet.
     kept: BTreeMap<u64, Kept>,
     next_id: u64,
-    /// Which stream letters take.
+    /// Stream of the messages.
     stream: Stream,
     ledger: Ledger,
     sent_bytes: u64,
 }
 
 impl DelayedDelivery {
-    pub(super) fn new(air: LinkEmulator, ego: &CavId, began_nanos: u64) -> Self {
+    pub(super) fn new(link: LinkEmulator, ego: &CavId, began_nanos: u64) -> Self {
         Self {
-            air,
+            link,
             receiver: process_id(Role::Ego, ego),
             ego: ego.clone(),
             began_nanos,
-            posted: BTreeMap::new(),
+            pending: BTreeMap::new(),
             kept: BTreeMap::new(),
             next_id: 0,
             stream: Stream::Bev,
@@ -65,12 +65,12 @@ impl DelayedDelivery {
         }
     }
 
-    /// Hands a pose over that will be sent at `nanos`.
-    pub(super) fn post_pose(&mut self, from: &CavId, sequence: u64, bytes: u64, nanos: u64, distance_m: f64) {
+    /// Hands over a pose that will be sent at `nanos`.
+    pub(super) fn enqueue_pose(&mut self, from: &CavId, sequence: u64, bytes: u64, nanos: u64, distance_m: f64) {
         self.hand_over(from, Stream::Pose, sequence, bytes, nanos, distance_m, None);
     }
 
-    /// Hands a message over that will be sent at `nanos`.
+    /// Hands over a message that will be sent at `nanos`.
     pub(super) fn enqueue(
         &mut self,
         stream: Stream,
@@ -78,21 +78,21 @@ impl DelayedDelivery {
         bytes: u64,
         nanos: u64,
         distance_m: f64,
-        mut letter: Envelope,
+        mut envelope: Envelope,
     ) {
         self.stream = stream;
-        let clock = self.air.clock();
-        letter.view.capture_nanos = clock.shown_since(self.began_nanos, letter.view.capture_nanos);
-        let from = letter.view.cav.clone();
-        self.hand_over(&from, stream, sequence, bytes, nanos, distance_m, Some(letter));
+        let clock = self.link.clock();
+        envelope.view.capture_nanos = clock.shown_since(self.began_nanos, envelope.view.capture_nanos);
+        let from = envelope.view.cav.clone();
+        self.hand_over(&from, stream, sequence, bytes, nanos, distance_m, Some(envelope));
     }
 
-    /// A map that is handed over was written so that it keeps within a limit.
+    /// Counts a map that the rate control has adapted.
     pub(super) fn adapted(&mut self, from: &CavId, stream: Stream, reason: RateReason) {
         self.ledger.adapted(&Account::published(topic(from, stream)), reason);
     }
 
-    #[expect(clippy::too_many_arguments, reason = "the fields of a parcel")]
+    #[expect(clippy::too_many_arguments, reason = "the fields of a packet")]
     fn hand_over(
         &mut self,
         from: &CavId,
@@ -101,47 +101,47 @@ impl DelayedDelivery {
         bytes: u64,
         nanos: u64,
         distance_m: f64,
-        letter: Option<Envelope>,
+        envelope: Option<Envelope>,
     ) {
         let id = self.next_id;
         self.next_id += 1;
-        self.kept.insert(id, Kept { topic: topic(from, stream), letter });
+        self.kept.insert(id, Kept { topic: topic(from, stream), envelope });
         let offered_nanos = nanos.saturating_sub(self.began_nanos);
         let (from, to) = (from.clone(), self.ego.clone());
         let parcel = Packet { id, from, to, stream, sequence, bytes, offered_nanos, distance_m };
-        self.posted.insert((offered_nanos, id), parcel);
+        self.pending.insert((offered_nanos, id), parcel);
     }
 
-    /// What has come by `nanos`, in the order of time. Everything that is sent until then was handed over.
+    /// Arrivals by `nanos`, in order of time. All messages that are sent until then have been handed over.
     pub(super) fn until(&mut self, nanos: u64) -> Vec<Arrived> {
         let nanos = nanos.saturating_sub(self.began_nanos);
-        while let Some(entry) = self.posted.first_entry().filter(|entry| entry.key().0 <= nanos) {
+        while let Some(entry) = self.pending.first_entry().filter(|entry| entry.key().0 <= nanos) {
             let parcel = entry.remove();
             self.ledger.sent(&Account::published(topic(&parcel.from, parcel.stream)));
             self.sent_bytes += parcel.bytes;
-            self.air.offer(parcel);
+            self.link.offer(parcel);
         }
-        self.air.advance(nanos).into_iter().filter_map(|outcome| self.settle(outcome)).collect()
+        self.link.advance(nanos).into_iter().filter_map(|outcome| self.settle(outcome)).collect()
     }
 
     fn settle(&mut self, outcome: Outcome) -> Option<Arrived> {
         let Outcome { nanos, parcel, fate } = outcome;
         let account = Account::towards(topic(&parcel.from, parcel.stream), &self.receiver);
-        let letter = match fate {
+        let envelope = match fate {
             Delivery::Dropped(reason) => {
                 self.kept.remove(&parcel.id);
                 self.ledger.dropped(&account, reason);
                 return None;
             }
             Delivery::Arrived { is_repeated: true, .. } => {
-                // The copy is one more message.
+                // The copy counts as one more message.
                 self.ledger.sent(&account);
-                self.kept.get(&parcel.id).and_then(|kept| kept.letter.clone())
+                self.kept.get(&parcel.id).and_then(|kept| kept.envelope.clone())
             }
-            Delivery::Arrived { .. } => self.kept.remove(&parcel.id).and_then(|kept| kept.letter),
+            Delivery::Arrived { .. } => self.kept.remove(&parcel.id).and_then(|kept| kept.envelope),
         };
-        match letter {
-            Some(letter) => Some(Arrived { nanos: nanos.saturating_add(self.began_nanos), letter }),
+        match envelope {
+            Some(envelope) => Some(Arrived { nanos: nanos.saturating_add(self.began_nanos), envelope }),
             None => {
                 self.ledger.received(&account);
                 None
@@ -159,9 +159,10 @@ impl DelayedDelivery {
         self.ledger.dropped(&Account::towards(topic(cav, self.stream), &self.receiver), reason);
     }
 
-    /// MessageStats what of a vehicle has not come to its end; `waiting` messages of it have arrived and were never used.
+    /// Counts a vehicle's messages that neither arrived nor were lost; `waiting` messages of it have arrived and were
+    /// never used.
     pub(super) fn close(&mut self, cav: &CavId, waiting: u64) {
-        let not_sent: BTreeSet<u64> = self.posted.values().map(|parcel| parcel.id).collect();
+        let not_sent: BTreeSet<u64> = self.pending.values().map(|parcel| parcel.id).collect();
         for (stream, waiting) in [(Stream::Pose, 0), (self.stream, waiting)] {
             let topic = topic(cav, stream);
             let under_way = self.kept.iter().filter(|(id, kept)| kept.topic == topic && !not_sent.contains(id)).count();
@@ -174,7 +175,7 @@ impl DelayedDelivery {
         self.sent_bytes
     }
 
-    /// The books.
+    /// The message accounting.
     pub(super) fn ledger(&self) -> &Ledger {
         &self.ledger
     }

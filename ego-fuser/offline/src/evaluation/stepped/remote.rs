@@ -1,7 +1,8 @@
-//! Vehicles whose pipelines run in processes of their own: sweeps go out over the bus, what they see comes back.
+//! Remote agents: vehicles' pipelines in processes of their own; sweeps are sent over the bus, their messages come
+//! back.
 //!
-//! All advance in lockstep: nobody gets the next sweep before everyone has answered to this one. So nothing is ever
-//! overwritten on the way, and no clock decides anything; when an answer counts as sent, virtual time says.
+//! All advance in lockstep: no process gets the next sweep before all have answered to this one. So nothing is
+//! overwritten in a queue, and no wall clock affects the result; send times are simulation time.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -23,43 +24,43 @@ use protocol::{
 use super::super::Sent;
 use ego_fuser::ego::Content;
 
-/// How long all vehicles together may take for a tick: a machine however busy, but not one that has lost a process.
+/// Timeout of all vehicles together for a tick: for a busy machine, but not for one that has lost a process.
 const PATIENCE: Duration = Duration::from_secs(120);
 
-/// Why the vehicles cannot be asked.
+/// Error of the remote agents.
 #[derive(Debug, thiserror::Error)]
 pub enum RemoteError {
-    /// The bus refuses.
+    /// The bus reported an error.
     #[error(transparent)]
     Bus(#[from] BusError),
-    /// Not all processes came up.
+    /// Not all processes joined.
     #[error(transparent)]
     NotReady(#[from] NotReady),
     /// A vehicle does not answer.
-    #[error("no answer of {cavs} to the sweep of {capture_nanos} ns; their logs may say why")]
+    #[error("no answer of {cavs} to the sweep of {capture_nanos} ns; see their logs")]
     Silent {
-        /// Which, with commas between.
+        /// Vehicles without an answer, separated by commas.
         cavs: String,
         /// Capture time of the sweep.
         capture_nanos: u64,
     },
-    /// What a vehicle says is unsound.
+    /// A vehicle's message is invalid.
     #[error("{topic}: {source}")]
     Unsound {
-        /// On which topic.
+        /// Topic of the message.
         topic: Topic,
-        /// What is wrong with it.
+        /// Cause.
         source: WireError,
     },
 }
 
-/// Where the sweeps of a vehicle go.
+/// Publishers of a vehicle's sweeps.
 struct Sensors {
     gnss: Publisher,
     lidar: Publisher,
 }
 
-/// All vehicles of a run in virtual time, each a process.
+/// All vehicles of a run in simulation time, each a process.
 pub struct RemotePool {
     inbox: Arc<Inbox>,
     sensors: BTreeMap<CavId, Sensors>,
@@ -72,7 +73,7 @@ impl fmt::Debug for RemotePool {
     }
 }
 
-/// What has come of an answer.
+/// The messages of an answer so far.
 #[derive(Default)]
 struct Answer {
     pose: Option<(PoseEstimate, u64)>,
@@ -80,11 +81,11 @@ struct Answer {
 }
 
 impl RemotePool {
-    /// Waits until the process of every vehicle is there, for `patience` at most. Each sends the stream named beside it.
-    /// When `stop` is requested nobody is waited for any more.
+    /// Waits until the process of every vehicle has joined, for `patience` at most. Each sends the stream named beside
+    /// it. The wait ends when `stop` is requested.
     ///
     /// # Errors
-    /// [`RemoteError`] names those that are not there.
+    /// [`RemoteError`] names those that have not joined.
     pub fn connect(
         bus: &Bus,
         vehicles: &[(CavId, Stream)],
@@ -114,12 +115,12 @@ impl RemotePool {
         Ok(Self { inbox, sensors, _subscriptions: subscriptions })
     }
 
-    /// There are no more sweeps.
+    /// Ends the streams of sweeps.
     pub(in super::super) fn finish(self) {
         self.sensors.into_values().flat_map(|sensors| [sensors.gnss, sensors.lidar]).for_each(Publisher::finish);
     }
 
-    /// Hands out the sweeps of a tick and waits for all answers, in the same order.
+    /// Sends the sweeps of a tick and waits for all answers, in the same order.
     pub(super) fn request(&self, frames: &[&Frame]) -> Result<Vec<Sent>, RemoteError> {
         for frame in frames {
             let Some(Sensors { gnss, lidar }) = self.sensors.get(&frame.cav) else { continue };

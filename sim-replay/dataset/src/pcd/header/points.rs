@@ -1,13 +1,14 @@
-//! How many points a header promises.
+//! Number of points that a header states.
 
 use super::super::PcdError;
 use super::Entries;
 
-/// More points than any sweep has; a header that promises more is wrong.
+/// Limit on the number of points, above that of any sweep; a header that states more is invalid.
 const MAX_POINTS: u64 = 50_000_000;
 
 impl Entries<'_> {
-    /// `POINTS`, or `WIDTH` times `HEIGHT`: whatever is there must fit, and one of `POINTS` and `WIDTH` must be.
+    /// `POINTS`, or `WIDTH` times `HEIGHT`: the values present must be consistent, and one of `POINTS` and `WIDTH` is
+    /// required.
     pub(super) fn points(&self) -> Result<usize, PcdError> {
         let (width, height, points) = (self.count("WIDTH")?, self.count("HEIGHT")?, self.count("POINTS")?);
         let (key, line, count) = match (width, points) {
@@ -40,12 +41,12 @@ impl Entries<'_> {
 fn check_product(width: u64, height: Option<u64>, line: u64, points: u64) -> Result<(), PcdError> {
     let fits = match height {
         Some(height) => width.checked_mul(height) == Some(points),
-        // As many rows as it takes.
+        // As many rows as needed.
         None => points.checked_rem(width).unwrap_or(points) == 0,
     };
     if fits {
         return Ok(());
     }
     let height = height.map_or_else(|| "of no HEIGHT".into(), |height| format!("x HEIGHT {height}"));
-    Err(PcdError::at(line, "POINTS", format!("{points}, but WIDTH {width} {height} says otherwise")))
+    Err(PcdError::at(line, "POINTS", format!("{points}, which does not match WIDTH {width} {height}")))
 }

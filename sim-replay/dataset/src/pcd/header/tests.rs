@@ -18,7 +18,7 @@ fn a_sound_header_is_taken_apart() {
 }
 
 #[test]
-fn what_does_not_fit_is_named_with_line_and_both_values() {
+fn inconsistent_values_are_reported_with_line_and_both_values() {
     let cases = [
         ("VERSION 0.7", "VERSION 1.0", "line 2: VERSION: \"1.0\", expected 0.7, 0.6 or 0.5"),
         ("SIZE 4 4 4 4", "SIZE 4 4 4", "line 4: SIZE: 3 values for 4 FIELDS"),
@@ -30,12 +30,12 @@ fn what_does_not_fit_is_named_with_line_and_both_values() {
         ("SIZE 4 4 4 4", "SIZE 4 4 4 8", "line 4: SIZE: 8 of field rgb, expected one of [4] for TYPE F"),
         ("COUNT 1 1 1 1", "COUNT 2 1 1 1", "line 3: COUNT: 2 of field x, expected 1"),
         ("FIELDS x y z rgb", "FIELDS x y h rgb", "line 3: FIELDS: no field z"),
-        ("FIELDS x y z rgb", "FIELDS x y z x", "line 3: FIELDS: x stands there twice"),
-        ("POINTS 2", "POINTS 3", "line 10: POINTS: 3, but WIDTH 2 x HEIGHT 1 says otherwise"),
+        ("FIELDS x y z rgb", "FIELDS x y z x", "line 3: FIELDS: x is given twice"),
+        ("POINTS 2", "POINTS 3", "line 10: POINTS: 3, which does not match WIDTH 2 x HEIGHT 1"),
         ("WIDTH 2", "WIDTH two", "line 7: WIDTH: \"two\" is no count"),
         ("WIDTH 2", "WIDTH -2", "line 7: WIDTH: \"-2\" is no count"),
-        ("WIDTH 2\nHEIGHT 1\n", "WIDTH 3\n", "line 9: POINTS: 2, but WIDTH 3 of no HEIGHT says otherwise"),
-        ("HEIGHT 1", "HEIGHT 1\nHEIGHT 1", "line 9: HEIGHT: stands here a second time"),
+        ("WIDTH 2\nHEIGHT 1\n", "WIDTH 3\n", "line 9: POINTS: 2, which does not match WIDTH 3 of no HEIGHT"),
+        ("HEIGHT 1", "HEIGHT 1\nHEIGHT 1", "line 9: HEIGHT: is given a second time"),
         ("VIEWPOINT 0 0 0 1 0 0 0", "VIEWPOINT 0 0", "line 9: VIEWPOINT: 2 values, expected 7"),
         ("VIEWPOINT 0 0 0 1 0 0 0", "VIEWPOINT 0 0 0 1 0 0 x", "line 9: VIEWPOINT: \"x\" is no finite number"),
         ("DATA ascii", "DATA hex", "line 11: DATA: \"hex\", expected ascii, binary or binary_compressed"),
@@ -65,7 +65,7 @@ fn parsed(text: &str) -> Header {
 }
 
 #[test]
-fn what_writers_leave_out_follows_from_the_rest() {
+fn missing_entries_follow_from_the_rest() {
     let sound = parsed(SOUND);
     for version in ["VERSION .7", "VERSION .6", "VERSION 0.6", "VERSION .5", "VERSION 0.5", "# no version"] {
         assert_eq!(parsed(&SOUND.replace("VERSION 0.7", version)), sound, "{version}");

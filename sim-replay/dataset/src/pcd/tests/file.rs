@@ -13,7 +13,7 @@ pub(super) enum Number {
     I1(i8),
     I2(i16),
     I4(i32),
-    /// So many bytes that mean nothing.
+    /// This number of padding bytes.
     Padding(usize),
 }
 
@@ -46,7 +46,7 @@ impl Number {
         }
     }
 
-    /// As C's `%.10g` prints it.
+    /// As printed by C's `%.10g`.
     fn text(self) -> String {
         match self {
             Self::F4(value) => ten_digits(f64::from(value)),
@@ -87,7 +87,7 @@ pub(super) struct File {
 }
 
 impl File {
-    /// The same point so many times.
+    /// This number of copies of one point.
     pub(super) fn new(fields: &[(&'static str, Number)], points: usize) -> Self {
         let (names, row): (Vec<_>, Vec<_>) = fields.iter().copied().unzip();
         Self { names, rows: vec![row; points], height: 1 }
@@ -98,7 +98,7 @@ impl File {
         Self { names: names.to_vec(), rows, height: 1 }
     }
 
-    /// The same points in so many rows of an organised cloud.
+    /// The same points as an organised cloud with this number of rows.
     pub(super) fn in_rows_of_height(self, height: usize) -> Self {
         Self { height, ..self }
     }

@@ -1,4 +1,4 @@
-//! Files as common writers make them, whole and damaged.
+//! Files as written by common writers, complete and damaged.
 
 mod file;
 mod writers;
@@ -10,7 +10,7 @@ use proptest::prelude::*;
 use super::*;
 use file::{File, Number};
 
-/// A file of each kind to damage: our own, and those of PCL and Open3D with what they leave behind.
+/// A file of each kind to damage: our own, and those of PCL and Open3D with their trailing bytes.
 static SAMPLES: LazyLock<Vec<Vec<u8>>> = LazyLock::new(|| {
     let cloud = PointCloud { xyzi: (0..20).map(|i| [i as f32, -1.5, 0.25, 1.0 - i as f32 / 64.0]).collect() };
     let ours = [Encoding::Ascii, Encoding::Binary]
@@ -23,13 +23,13 @@ static SAMPLES: LazyLock<Vec<Vec<u8>>> = LazyLock::new(|| {
 });
 
 #[test]
-fn every_truncation_is_an_error_or_cuts_what_is_not_needed() {
+fn every_truncation_is_an_error_or_cuts_unneeded_bytes() {
     for file in SAMPLES.iter() {
         let whole = decode(file).unwrap();
         let is_text = file.windows(10).any(|window| window == b"DATA ascii");
         for length in 0..file.len() {
             let Ok(cloud) = decode(&file[..length]) else { continue };
-            // Digits of the last number may be cut; what stands behind the points is not needed.
+            // Digits of the last number may be cut; bytes after the points are not needed.
             let (all, kept) = (whole.points.len() + whole.dropped, cloud.points.len() + cloud.dropped);
             assert_eq!(kept, all, "{length} of {}", file.len());
             let last_token = file.len() - file.iter().rev().skip(2).position(|&byte| byte == b' ').unwrap_or(0) - 2;
@@ -71,7 +71,7 @@ proptest! {
             file.truncate(cut.index(file.len()));
         }
         if let Ok(cloud) = decode(&file) {
-            // A byte of LZF becomes 88 at most, and three bytes of a point 16.
+            // A byte of LZF expands to 88 at most, and three bytes of a point to 16.
             prop_assert!(cloud.points.xyzi.capacity() <= 88 * file.len());
         }
     }

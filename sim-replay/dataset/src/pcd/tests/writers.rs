@@ -3,7 +3,7 @@
 use super::file::{File, Number};
 use super::*;
 
-/// A file of a public writer, and what must come out.
+/// A file of a public writer, and the expected result.
 pub(super) struct Variant {
     name: String,
     pub(super) bytes: Vec<u8>,
@@ -18,7 +18,7 @@ fn coordinates(index: usize) -> [f32; 3] {
     [60.0 * (0.7 * t).cos() + 1e-3 * t, (0.7 * t).sin() * 1.5e-5, -1.9 + 0.113 * t]
 }
 
-/// Red of a point: every value from nothing to all, with subnormal words among them.
+/// Red of a point: all values from 0 to 255, with subnormal words among them.
 fn red(index: usize) -> u8 {
     (index * 23 % 256) as u8
 }
@@ -79,8 +79,8 @@ fn open3d_tensors() -> Vec<Variant> {
     variants
 }
 
-/// A Velodyne's cloud as `pcl_ros` keeps it: padding to the offsets of the message, rays that met nothing in an organised
-/// cloud, files stretched to whole pages. Packed and in text PCL leaves padding out.
+/// A Velodyne's cloud as written by `pcl_ros`: padding to the offsets of the message, rays without a hit in an
+/// organised cloud, files extended to whole pages. In packed and text files PCL leaves padding out.
 fn pcl_ros() -> Vec<Variant> {
     let position = |index: usize| if index % 7 == 3 { [f32::NAN; 3] } else { coordinates(index) };
     let row = |index: usize, is_padded: bool| {

@@ -1,4 +1,4 @@
-//! Layouts of the OPV2V family: a folder per agent, some files per frame.
+//! Layouts of the OPV2V family: a folder per agent, several files per frame.
 
 use std::path::{Path, PathBuf};
 
@@ -19,7 +19,7 @@ pub(super) struct AgentFolders {
 }
 
 impl AgentFolders {
-    /// Makes the folders anew.
+    /// Creates the folders, removing old ones.
     pub(super) fn make(root: &Path, scene: &SceneHeader) -> Result<Self, SynthError> {
         let folder = scene_path(root, &scene.name);
         make_fresh_folder(&folder)?;
@@ -32,17 +32,17 @@ impl AgentFolders {
         Ok(Self { agents, is_roadside, ticks, mark })
     }
 
-    /// Whether an agent is a unit at the roadside.
+    /// True if an agent is a roadside unit.
     pub(super) fn is_roadside(&self, frame: &AgentFrame) -> bool {
         self.is_roadside[frame.agent]
     }
 
-    /// A file of an agent's frame: `suffix` follows the number of the tick.
+    /// A file of an agent's frame: `suffix` follows the tick number.
     pub(super) fn file(&self, moment: &Moment, frame: &AgentFrame, suffix: &str) -> PathBuf {
         self.agents[frame.agent].join(format!("{:06}{suffix}", self.ticks[moment.index]))
     }
 
-    /// All is written.
+    /// Finishes the folders: all files are written.
     pub(super) fn close(self) -> Result<(), SynthError> {
         self.mark.clear()
     }

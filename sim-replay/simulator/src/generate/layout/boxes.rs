@@ -1,4 +1,4 @@
-//! Boxes and intensities in the terms that several layouts share.
+//! Boxes and intensities in formats that several layouts share.
 
 use nalgebra::{Isometry3, Point3};
 use protocol::{Box3d, PointCloud};
@@ -7,7 +7,7 @@ use super::AgentFrame;
 use dataset::frame::{Object, ObjectClass};
 use dataset::ground_truth::upright_box;
 
-/// Intensity at which a sensor's byte is full.
+/// Intensity value that corresponds to 1.
 const FULL_BYTE: f32 = 255.0;
 /// Channels of the LiDAR of generated scenes, and the elevations of the lowest and the highest, degrees.
 const CHANNELS: f32 = 64.0;
@@ -27,7 +27,7 @@ pub(super) fn byte(intensity: f32) -> u8 {
     (intensity * FULL_BYTE).round() as u8
 }
 
-/// The channel of the LiDAR of generated scenes that looks in the direction of a point, counted from below.
+/// The channel, counted from below, of the LiDAR of generated scenes in the direction of a point.
 pub(super) fn ring([x, y, z, _]: [f32; 4]) -> u8 {
     let elevation_deg = z.atan2(x.hypot(y)).to_degrees();
     let [low, high] = ELEVATIONS_DEG;
@@ -53,8 +53,8 @@ pub(super) fn upright_in(frame: &AgentFrame, object: &Object) -> Box3d {
     upright_box(object, &frame.world_from_lidar().inverse())
 }
 
-/// The corners of the box in the world, metres: `(+l, +w) (+l, -w) (-l, -w) (-l, +w)` of the bottom face, then of the top
-/// face. They keep the tilt of the box.
+/// The corners of the box in the world, metres: `(+l, +w) (+l, -w) (-l, -w) (-l, +w)` of the bottom face, then of the
+/// top face. They keep the tilt of the box.
 pub(super) fn world_corners(object: &Object) -> [[f64; 3]; 8] {
     const SIGNS: [(f64, f64); 4] = [(1.0, 1.0), (1.0, -1.0), (-1.0, -1.0), (-1.0, 1.0)];
     let world_from_object = object.world_from_object.isometry();
@@ -66,14 +66,14 @@ pub(super) fn world_corners(object: &Object) -> [[f64; 3]; 8] {
     })
 }
 
-/// How many points of the sweep lie in the object's box.
+/// Number of points of the sweep in the object's box.
 pub(super) fn points_in(frame: &AgentFrame, object: &Object) -> usize {
     let object_from_lidar: Isometry3<f32> =
         (object.world_from_object.isometry().inverse() * frame.world_from_lidar()).cast();
     let half = object.size_m.map(|size| (size / 2.0) as f32);
     let center = object_from_lidar.inverse().translation.vector;
     let reach = half.iter().map(|half| half * half).sum::<f32>().sqrt();
-    // Nearly all points are far away in x or y, which needs no transform to be seen.
+    // Most points are far away in x or y; this test needs no transform.
     let near = |&&[x, y, ..]: &&[f32; 4]| (x - center.x).abs() <= reach && (y - center.y).abs() <= reach;
     let inside = |&&[x, y, z, _]: &&[f32; 4]| {
         let local = object_from_lidar * Point3::new(x, y, z);

@@ -1,8 +1,9 @@
-//! DAIR-V2X-C and V2X-Seq SPD: the ego as the vehicle, one other agent as the roadside unit, and labels of both together.
+//! DAIR-V2X-C and V2X-Seq SPD: the ego as the vehicle, one other agent as the roadside unit, and labels of both
+//! together.
 //!
-//! All scenes of a data set lie in one root, each a batch (DAIR) or a sequence (SPD). Frames have numbers of six digits, and
-//! those of the unit are others than those of the vehicle. Intensities are 0 to 255. There are no images, though the paths
-//! of images stand in the lists, as loaders take numbers from them.
+//! All scenes of a data set are in one root, each as a batch (DAIR) or a sequence (SPD). Frames have numbers of six
+//! digits; the numbers of the unit differ from those of the vehicle. Intensities are 0 to 255. There are no images, but
+//! the lists hold paths of images, since loaders parse numbers from them.
 
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
@@ -20,18 +21,19 @@ use dataset::frame::Object;
 use dataset::ground_truth::upright_box;
 use dataset::pcd::{self, Encoding, IntensityField};
 
-/// The first number of the unit's frames, and by how much at most the vehicle's count.
+/// First number of the unit's frames; also the upper limit of the number of vehicle frames.
 const FIRST_UNIT_FRAME: usize = 500_000;
-/// Time stamps of a scene count from here on, microseconds, with a day between two scenes.
+/// Time stamps of a scene start here, microseconds, with a day between two scenes.
 const EPOCH_MICROS: u64 = 1_626_155_000_000_000;
 const DAY_MICROS: u64 = 86_400_000_000;
 
-/// Which of the two relatives.
+/// Variant of the layout.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Edition {
     /// Pairs by paths, cooperative labels in the world.
     Dair,
-    /// Pairs by numbers of frames and sequences, cooperative labels in the frame of the vehicle's LiDAR, with track ids.
+    /// Pairs by numbers of frames and sequences, cooperative labels in the frame of the vehicle's LiDAR, with track
+    /// ids.
     V2xSeq,
 }
 
@@ -49,7 +51,7 @@ const UNIT: Side = Side { folder: "infrastructure-side", labels: "virtuallidar" 
 pub(super) struct Dair {
     root: PathBuf,
     edition: Edition,
-    /// Scenes that were begun.
+    /// Number of scenes begun.
     scenes: usize,
     /// Number of the next scene's first frame.
     next_frame: usize,
@@ -63,12 +65,12 @@ pub(super) struct Dair {
 struct Batch {
     number: usize,
     first_frame: usize,
-    /// Which agent is the roadside unit.
+    /// Index of the agent that is the roadside unit.
     unit: usize,
     capture_nanos: Vec<u64>,
 }
 
-/// What the lists hold of a moment.
+/// Rows of the lists for one capture time.
 #[derive(Debug)]
 struct Rows {
     vehicle: Value,
@@ -133,7 +135,7 @@ impl Dair {
         self.write_json(&format!("{}/label/{}/{id}.json", side.folder, side.labels), &Value::Array(labels))
     }
 
-    /// Where the vehicle's LiDAR is, in the two steps of the data set.
+    /// Writes the pose of the vehicle's LiDAR, in the two steps of the data set.
     fn write_vehicle_pose(&self, id: &str, frame: &AgentFrame) -> Result<(), SynthError> {
         let world_from_lidar = frame.world_from_lidar();
         let world_from_novatel = frame.frame.world_from_vehicle.map_or(world_from_lidar, |vehicle| vehicle.isometry());
@@ -176,7 +178,7 @@ impl SceneWriter for Dair {
             self.make_folders()?;
         }
         write_origin(&self.root, scene)?;
-        // A unit where there is one; the second agent takes its part elsewhere.
+        // A roadside unit if there is one, else the second agent.
         let unit = (1..scene.agents.len()).find(|&agent| scene.agents[agent].is_roadside).unwrap_or(1);
         let (number, first_frame) = (self.scenes, self.next_frame);
         self.scene = Some(Batch { number, first_frame, unit, capture_nanos: scene.capture_nanos.clone() });
@@ -227,7 +229,7 @@ impl SceneWriter for Dair {
 }
 
 impl Dair {
-    /// The rows of a moment in the lists.
+    /// The rows of a capture time in the lists.
     fn rows_of(&self, batch: &Batch, moment: &Moment, id: &str, unit_id: &str) -> Rows {
         let micros = EPOCH_MICROS + batch.number as u64 * DAY_MICROS + batch.capture_nanos[moment.index] / 1000;
         let last_frame = batch.first_frame + batch.capture_nanos.len() - 1;

@@ -34,7 +34,7 @@ pub(super) fn transform(pose: &Pose) -> Value {
     json!({ "rotation": rows, "translation": pose.translation_m.map(|metres| [metres]) })
 }
 
-/// The label of an upright box: its place is the centre, `rotation` turns it about z.
+/// The label of an upright box: its position is the centre, `rotation` turns it about z.
 pub(super) fn upright_label(kind: &str, id: i64, upright: &Box3d) -> Value {
     let [length, width, height] = upright.size_m;
     let [x, y, z] = upright.center_m;
@@ -50,7 +50,7 @@ pub(super) fn upright_label(kind: &str, id: i64, upright: &Box3d) -> Value {
     })
 }
 
-/// The cooperative label of DAIR-V2X: its corners in the world are what readers go by.
+/// The cooperative label of DAIR-V2X: readers use its corners in the world.
 pub(super) fn world_label(kind: &str, object: &Object, upright_in_world: &Box3d) -> Value {
     let mut label = upright_label(kind, object.id, upright_in_world);
     label["world_8_points"] = json!(world_corners(object));

@@ -1,4 +1,4 @@
-//! Files and folders of scenes that are written, with the path in every error.
+//! File system access of scene writers, with the path in every error.
 
 use std::path::{Component, Path, PathBuf};
 use std::{fs, io};
@@ -21,7 +21,7 @@ pub(crate) fn make_folder(path: &Path) -> Result<(), SynthError> {
     fs::create_dir_all(path).map_err(|source| failed(path, source))
 }
 
-/// Makes a folder; one that was there is removed with all that it holds.
+/// Creates a folder; an existing one is removed with its contents.
 pub(super) fn make_fresh_folder(path: &Path) -> Result<(), SynthError> {
     match fs::remove_dir_all(path) {
         Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(failed(path, error)),
@@ -30,13 +30,13 @@ pub(super) fn make_fresh_folder(path: &Path) -> Result<(), SynthError> {
     make_folder(path)
 }
 
-/// The folder of a scene below `root`: its name can lead nowhere else.
+/// The folder of a scene below `root`; no name leads outside `root`.
 pub(crate) fn scene_path(root: &Path, name: &str) -> PathBuf {
     let parts = Path::new(name).components().filter(|part| matches!(part, Component::Normal(_)));
     root.join(parts.collect::<PathBuf>())
 }
 
-/// Writes how a scene came to be, in a file that no reader takes for a frame.
+/// Writes the origin of a scene, in a file that no reader takes for a frame.
 pub(super) fn write_origin(folder: &Path, scene: &SceneHeader) -> Result<(), SynthError> {
     write_file(&folder.join(format!("{}.origin.txt", flat_name(&scene.name))), &scene.origin)
 }
@@ -48,7 +48,7 @@ fn flat_name(name: &str) -> String {
     text.trim_start_matches('.').to_owned()
 }
 
-/// The mark of a folder that is being written. It stays where the run does not come to its end, and the reader reports it.
+/// Marker file of a folder that is being written. It stays after an interrupted run, and the reader reports it.
 #[derive(Debug)]
 pub(crate) struct Unfinished(PathBuf);
 
@@ -60,7 +60,7 @@ impl Unfinished {
         Ok(Self(mark))
     }
 
-    /// Takes the mark away: all is written.
+    /// Removes the marker: all files are written.
     pub(crate) fn clear(self) -> Result<(), SynthError> {
         fs::remove_file(&self.0).map_err(|source| failed(&self.0, source))
     }

@@ -96,7 +96,7 @@ fn labels(frame: &AgentFrame) -> String {
 struct Label {
     /// Height, width, length.
     size_m: [f64; 3],
-    /// The middle of the bottom face in the frame of the camera.
+    /// The centre of the bottom face in the frame of the camera.
     bottom_m: [f64; 3],
     /// Turn of the length about y from x towards -z.
     rotation_y_rad: f64,

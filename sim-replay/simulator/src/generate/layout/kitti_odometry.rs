@@ -1,6 +1,7 @@
 //! KITTI odometry: `sequences/<number>/{velodyne,calib.txt,times.txt}` and `poses/<number>.txt`.
 //!
-//! Poses are of the left camera, in the frame of the first scan's camera: where the sequence lies in the world is lost.
+//! Poses are of the left camera, in the frame of the first scan's camera: the position of the sequence in the world is
+//! lost.
 
 use std::fmt::Write as _;
 use std::path::Path;
@@ -75,7 +76,8 @@ fn times(capture_nanos: &[u64]) -> String {
     text
 }
 
-/// A line for each moment, as the number of the line is that of the scan: where there is none, the pose before it.
+/// One line per capture time, since the line number is the scan number; where there is no pose, the previous one is
+/// repeated.
 fn pose_lines(sequence: &Sequence<'_>) -> String {
     let camera_from_lidar = camera_from_lidar();
     let Some(first) = sequence.sweeps.first() else { return String::new() };

@@ -1,4 +1,4 @@
-//! Open MARS, multiagent subset, in the tables of nuScenes: the names of vehicles end the names of channels.
+//! Open MARS, multiagent subset, in the tables of nuScenes: channel names end with the names of vehicles.
 
 use serde_json::{Map, Value, json};
 

@@ -1,8 +1,8 @@
-//! Layouts on disk that scenes are written in: one file per layout, one [`Frame`] for all.
+//! Layouts on disk in which scenes are written: one file per layout, one [`Frame`] for all.
 //!
-//! A [`SceneWriter`] receives the moments of one scene after another, in the convention of [`dataset::frame`]: the type that
-//! the readers produce. Axes, units and file formats of a layout stand in its writer alone. A new layout is one file
-//! beside this one, a line in [`SceneLayout`] and a line in [`SceneLayout::writer`].
+//! A [`SceneWriter`] receives the capture times of one scene after another, in the convention of [`dataset::frame`]:
+//! the type that the readers produce. Axes, units and file formats of a layout are confined to its writer. A new layout
+//! is one file beside this one, a line in [`SceneLayout`] and a line in [`SceneLayout::writer`].
 
 mod agent_folders;
 mod boxes;
@@ -43,7 +43,8 @@ pub(crate) use disk::{Unfinished, make_folder};
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, ValueEnum)]
 #[value(rename_all = "kebab-case")]
 pub enum SceneLayout {
-    /// OPV2V, V2XSet: a folder per agent with PCD and YAML, left-handed. Alone holds radar, GNSS and copies in other weather.
+    /// OPV2V, V2XSet: a folder per agent with PCD and YAML, left-handed. The only layout with radar, GNSS and copies in
+    /// other weather.
     #[default]
     #[value(name = "opv2v")]
     Opv2v,
@@ -92,7 +93,7 @@ impl SceneLayout {
         }
     }
 
-    /// Whether scenes of one agent have no place in it.
+    /// True if it cannot hold scenes of one agent.
     pub(super) fn needs_two_agents(self) -> bool {
         matches!(self, Self::Dair | Self::V2xseq)
     }
@@ -117,19 +118,19 @@ impl SceneLayout {
 
 /// Writes scenes in one layout, one after another.
 pub(crate) trait SceneWriter: Send + Sync {
-    /// Begins a scene. What an earlier run left under its name is removed.
+    /// Begins a scene. Files of an earlier run under its name are removed.
     fn begin(&mut self, scene: &SceneHeader) -> Result<(), SynthError>;
 
-    /// Writes one moment of the scene: from any thread, in any order, each moment once. What the layout has no place for is
-    /// counted in `omitted`.
+    /// Writes one capture time of the scene: from any thread, in any order, each once. Data that the layout cannot hold
+    /// are counted in `omitted`.
     fn write(&self, moment: &Moment, omitted: &Omissions) -> Result<(), SynthError>;
 
-    /// Ends the scene: writes what several of its moments share.
+    /// Ends the scene: writes data shared by its capture times.
     fn end(&mut self) -> Result<(), SynthError> {
         Ok(())
     }
 
-    /// Ends the data set: writes what several of its scenes share.
+    /// Ends the data set: writes data shared by its scenes.
     fn finish(&mut self) -> Result<(), SynthError> {
         Ok(())
     }
@@ -138,7 +139,7 @@ pub(crate) trait SceneWriter: Send + Sync {
 /// A scene before its first moment.
 #[derive(Debug, Clone)]
 pub(crate) struct SceneHeader {
-    /// Its name, in parts by `/` where it lies in folders.
+    /// Its name; parts separated by `/` are folders.
     pub(crate) name: String,
     /// Its agents, ego first.
     pub(crate) agents: Vec<SceneAgent>,
@@ -146,7 +147,7 @@ pub(crate) struct SceneHeader {
     pub(crate) capture_nanos: Vec<u64>,
     /// Length of a tick of the clock that OPV2V's file names count, nanoseconds. Capture times are multiples of it.
     pub(crate) tick_nanos: u64,
-    /// Text of `data_protocol.yaml`: how the scene came to be.
+    /// Text of `data_protocol.yaml`: the origin of the scene.
     pub(crate) origin: String,
 }
 
@@ -154,14 +155,14 @@ pub(crate) struct SceneHeader {
 #[derive(Debug, Clone)]
 pub(crate) struct SceneAgent {
     pub(crate) id: CavId,
-    /// A unit at the roadside rather than a vehicle.
+    /// True for a roadside unit, false for a vehicle.
     pub(crate) is_roadside: bool,
 }
 
 /// The frames of the agents that are present at one capture time.
 #[derive(Debug)]
 pub(crate) struct Moment {
-    /// Place among the scene's capture times.
+    /// Index of the capture time in the scene.
     pub(crate) index: usize,
     /// In the order of the scene's agents.
     pub(crate) frames: Vec<AgentFrame>,
@@ -170,13 +171,13 @@ pub(crate) struct Moment {
 /// One agent's frame.
 #[derive(Debug)]
 pub(crate) struct AgentFrame {
-    /// Place among the scene's agents.
+    /// Index of the agent in the scene.
     pub(crate) agent: usize,
     /// The frame, with points.
     pub(crate) frame: Frame,
     /// Copies of the sweep in other weather.
     pub(crate) variants: Vec<SweepVariant>,
-    /// What only generated scenes know.
+    /// Data that only simulation provides.
     pub(crate) simulated: Option<Simulated>,
 }
 
@@ -186,21 +187,21 @@ pub(crate) struct SweepVariant {
     pub(crate) name: String,
     /// x, y, z in metres and intensity, in the frame of the LiDAR.
     pub(crate) points: Vec<[f32; 4]>,
-    /// For each point 1 where it is clutter in the air, else 0.
+    /// For each point 1 if it is clutter (fog or snow), else 0.
     pub(crate) labels: Vec<u8>,
 }
 
-/// Facts of a simulated frame for which [`Frame`] has no place.
+/// Simulated data that [`Frame`] does not hold.
 #[derive(Debug)]
 pub(crate) struct Simulated {
-    /// What the receivers measured.
+    /// GNSS and IMU measurements.
     pub(crate) fix: Fix,
-    /// For each object the point on the ground under its middle, in the world, and the way from there to the centre of the
-    /// box, metres.
+    /// For each object the point on the ground under its centre, in the world, and the offset from there to the centre
+    /// of the box, metres.
     pub(crate) anchors: Vec<BoxAnchor>,
 }
 
-/// Where OPV2V puts an object: a point that is not the centre of its box.
+/// OPV2V's reference point of an object, which is not the centre of its box.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct BoxAnchor {
     pub(crate) location_m: [f64; 3],
@@ -208,7 +209,7 @@ pub(crate) struct BoxAnchor {
 }
 
 impl AgentFrame {
-    /// The pose of the LiDAR in the world. Frames without are not given to writers.
+    /// The pose of the LiDAR in the world. Writers get no frames without a pose.
     pub(crate) fn world_from_lidar(&self) -> nalgebra::Isometry3<f64> {
         self.frame.world_from_lidar.unwrap_or(protocol::Pose::IDENTITY).isometry()
     }
@@ -220,7 +221,7 @@ impl Moment {
         self.frames.iter().find(|frame| frame.agent == agent)
     }
 
-    /// Everything that any of these frames lists, each object once: as the first frame that lists it has it.
+    /// Every object listed in any of these frames, once: as in the first frame that lists it.
     fn union<'a>(frames: impl IntoIterator<Item = &'a AgentFrame>) -> Vec<&'a Object> {
         let mut seen = std::collections::HashSet::new();
         let objects = frames.into_iter().flat_map(|frame| &frame.frame.objects);
@@ -228,7 +229,7 @@ impl Moment {
     }
 }
 
-/// What a layout had no place for: counts by what it is.
+/// Data that a layout cannot hold: counts by kind.
 #[derive(Debug, Default)]
 pub(crate) struct Omissions(Mutex<BTreeMap<&'static str, u64>>);
 
@@ -246,7 +247,7 @@ impl Omissions {
     }
 }
 
-/// The content of a lock: a thread that panicked while it held it ends the program anyway.
+/// The content of a lock, also after a panic of a thread that held it, since such a panic ends the program.
 pub(crate) fn locked<T>(mutex: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
 }

@@ -11,7 +11,7 @@ use super::disk::{make_folder, write_file};
 use super::sequences::{Sequence, Style, date, pose_z_down, z_down};
 use crate::generate::error::SynthError;
 
-/// Resolution of a coordinate, metres, and the least one.
+/// Resolution of a coordinate, metres, and the least coordinate.
 const STEP_M: f64 = 0.005;
 const LEAST_M: f64 = -100.0;
 
@@ -74,7 +74,7 @@ impl Style for Nclt {
     }
 }
 
-/// A coordinate as a number of steps, where there is one.
+/// A coordinate as a number of steps, if it is in range.
 fn steps(metres: f32) -> Option<u16> {
     let steps = ((f64::from(metres) - LEAST_M) / STEP_M).round();
     (0.0..=f64::from(u16::MAX)).contains(&steps).then_some(steps as u16)

@@ -1,6 +1,6 @@
 //! Data sets in the tables of nuScenes: sweeps of five floats (x, y, z, intensity, ring) and JSON tables beside them.
 //!
-//! A sample holds the sweeps of all agents at one capture time. Its annotations are what any agent lists, in the world.
+//! A sample holds the sweeps of all agents at one capture time. Its annotations are those of any agent, in the world.
 
 use std::fmt::Debug;
 use std::path::{Path, PathBuf};
@@ -14,13 +14,13 @@ use super::nuscenes_tables::{AnnotationRecord, Sample, SceneTables, SweepRecord,
 use super::{AgentFrame, Moment, Omissions, SceneHeader, SceneWriter, locked};
 use crate::generate::error::SynthError;
 
-/// Time stamps of a scene count from here on, microseconds, with a day between two scenes.
+/// Time stamps of a scene start here, microseconds, with a day between two scenes.
 const EPOCH_MICROS: u64 = 1_696_454_400_000_000;
 const DAY_MICROS: u64 = 86_400_000_000;
 /// The folder of the sweeps.
 const SWEEPS: &str = "sweeps";
 
-/// In what data sets with these tables differ.
+/// Differences between data sets with these tables.
 pub(super) trait Style: Debug + Send + Sync {
     /// The folder of the tables.
     fn version(&self) -> &'static str;
@@ -28,10 +28,10 @@ pub(super) trait Style: Debug + Send + Sync {
     /// The channel of each agent's LiDAR.
     fn channels(&self, scene: &SceneHeader) -> Vec<String>;
 
-    /// The file of a sweep in the folder of its channel, by number of scene and moment and time in microseconds.
+    /// The file of a sweep in the folder of its channel, by number of scene and capture time and time in microseconds.
     fn file_name(&self, scene: usize, moment: usize, micros: u64) -> String;
 
-    /// The number that stands for an intensity of 0 to 1.
+    /// Value in the file for an intensity of 0 to 1.
     fn intensity(&self, intensity: f32) -> f32;
 
     /// Fields of a row of scenes that only this data set has.

@@ -1,6 +1,6 @@
 //! The tables of nuScenes: rows that refer to each other by tokens.
 //!
-//! Tokens are hashes of what the row is, so that the same scenes give the same files.
+//! Tokens are hashes of the row's identity, so that the same scenes give the same files.
 
 use std::collections::BTreeMap;
 
@@ -14,7 +14,7 @@ use dataset::frame::{Object, ObjectClass};
 
 /// Bytes of a token: 32 digits.
 const TOKEN_BYTES: usize = 16;
-/// Tables that readers want to exist, though nothing stands in them.
+/// Tables that readers require, though they are empty.
 const EMPTY_TABLES: [&str; 2] = ["attribute", "visibility"];
 
 /// A sweep that was written.
@@ -27,7 +27,7 @@ pub(super) struct SweepRecord {
     pub(super) world_from_vehicle: Option<Pose>,
 }
 
-/// An object that any agent lists.
+/// An object listed by any agent.
 #[derive(Debug)]
 pub(super) struct AnnotationRecord {
     pub(super) object: Object,
@@ -44,7 +44,7 @@ pub(super) struct Sample {
     pub(super) annotations: Vec<AnnotationRecord>,
 }
 
-/// A scene whose moments are written.
+/// A scene whose capture times are written.
 #[derive(Debug)]
 pub(super) struct SceneTables<'a> {
     pub(super) number: usize,
@@ -53,7 +53,7 @@ pub(super) struct SceneTables<'a> {
     pub(super) channels: &'a [String],
     /// Further fields of the row of scenes.
     pub(super) fields: Map<String, Value>,
-    /// In order.
+    /// Samples by rising capture time.
     pub(super) samples: &'a [Sample],
 }
 
@@ -61,7 +61,7 @@ pub(super) struct SceneTables<'a> {
 #[derive(Debug, Default)]
 pub(super) struct Tables(BTreeMap<&'static str, Vec<Value>>);
 
-/// Where a sensor sits on its vehicle, and the token of the row that holds it.
+/// Pose of a sensor on its vehicle, and the token of its row.
 struct Mount {
     token: String,
     vehicle_from_lidar: Isometry3<f64>,
@@ -72,7 +72,7 @@ impl Tables {
         self.0.entry(table).or_default().push(row);
     }
 
-    /// All tables, with those that are empty.
+    /// All tables, empty ones included.
     pub(super) fn into_tables(mut self) -> BTreeMap<&'static str, Vec<Value>> {
         for name in EMPTY_TABLES.into_iter().chain(["instance", "sample_annotation", "category", "map"]) {
             self.0.entry(name).or_default();
@@ -144,7 +144,7 @@ impl Tables {
             for (((sample, sweep, sample_token), token), (prev, next)) in
                 chain.iter().zip(&tokens).zip(neighbours(&tokens))
             {
-                // The mount is that of the first sweep, so that one row of it serves the scene.
+                // The mount is that of the first sweep, so that one row serves the whole scene.
                 let world_from_vehicle: Pose = (sweep.world_from_lidar * mount.vehicle_from_lidar.inverse()).into();
                 self.push(
                     "ego_pose",
@@ -166,7 +166,7 @@ impl Tables {
     }
 
     fn add_mount(&mut self, scene: &SceneTables<'_>, channel: &str, first: &SweepRecord) -> Mount {
-        // A sensor is one row, though several scenes have it.
+        // A sensor is one row, also if several scenes use it.
         let sensor = token(&["sensor", channel]);
         let known = self.0.get("sensor").is_some_and(|rows| rows.iter().any(|row| row["token"] == sensor.as_str()));
         if !known {
@@ -227,7 +227,7 @@ impl Tables {
         }
     }
 
-    /// The token of a category's row, which is added where it is missing.
+    /// The token of a category's row; the row is added if it is missing.
     fn category(&mut self, class: ObjectClass) -> String {
         let name = category_name(class);
         let token = token(&["category", name]);

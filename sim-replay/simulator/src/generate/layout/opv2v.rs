@@ -42,7 +42,7 @@ fn pcd_of(points: &[[f32; 4]], intensity: IntensityField<'_>) -> Vec<u8> {
 
 fn frame_yaml(frame: &AgentFrame, is_roadside: bool) -> String {
     let mut yaml = String::with_capacity(512 + 400 * frame.frame.objects.len());
-    write_frame(&mut yaml, frame, is_roadside).expect("a String takes all that is written to it");
+    write_frame(&mut yaml, frame, is_roadside).expect("writing to a String cannot fail");
     yaml
 }
 
@@ -88,14 +88,14 @@ fn write_vehicles(yaml: &mut String, agent: &AgentFrame) -> std::fmt::Result {
     writeln!(yaml, "vehicles:")?;
     for (object, anchor) in agent.frame.objects.iter().zip(anchors(agent)) {
         let mut more = vec![("class", class(object.class).to_owned())];
-        // What is no vehicle must not count as one.
+        // Objects that are not vehicles must not count as vehicles.
         if let ObjectClass::TwoWheeler | ObjectClass::Pedestrian | ObjectClass::Other = object.class {
             more.push(("obj_type", super::boxes::real_type(object.class).to_owned()));
         }
         let entry = ObjectEntry {
             id: object.id,
             angle_deg: CarlaPose::from_pose(&object.world_from_object).roll_yaw_pitch_deg,
-            // Readers add the offset of the centre without turning it, so it is turned here.
+            // Readers add the offset of the centre without rotating it, so it is rotated here.
             location_m: mirrored_point(anchor.location_m),
             center_m: mirrored_point(anchor.center_offset_m),
             size_m: object.size_m,

@@ -1,5 +1,5 @@
-//! Oxford as LightLoc converts it: `<day and time>/velodyne_left/<microseconds>.bin`, floats component by component, and
-//! poses in `velodyne_left_False.h5`; axes have z down.
+//! Oxford as LightLoc converts it: `<day and time>/velodyne_left/<microseconds>.bin`, floats component by component,
+//! and poses in `velodyne_left_False.h5`; axes have z down.
 
 use std::path::Path;
 
@@ -10,7 +10,7 @@ use super::sequences::{Sequence, Style, SweepPose, date, pose_z_down, z_down};
 use crate::generate::error::SynthError;
 use dataset::hdf5_file::poses_file;
 
-/// Entries at either end of the poses that LightLoc leaves out.
+/// Poses at either end that LightLoc drops.
 const TRIMMED: usize = 5;
 
 /// The style.
@@ -53,7 +53,7 @@ impl Style for Oxford {
     }
 }
 
-/// Time stamps and rows of 3x4 matrices. Those that are left out by readers are copies of the first and of the last pose.
+/// Time stamps and rows of 3x4 matrices. The entries that readers drop are copies of the first and of the last pose.
 fn padded(first: &SweepPose, sweeps: &[SweepPose], last: &SweepPose) -> (Vec<i64>, Vec<[f64; 12]>) {
     let before = (1..=TRIMMED as u64).rev().map(|step| SweepPose { micros: first.micros - step, ..*first });
     let after = (1..=TRIMMED as u64).map(|step| SweepPose { micros: last.micros + step, ..*last });

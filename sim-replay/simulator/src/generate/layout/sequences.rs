@@ -1,4 +1,4 @@
-//! Layouts of one vehicle: each agent of each scene is a sequence, with a file per sweep and its poses in files for all.
+//! Layouts of one vehicle: each agent of each scene is a sequence, with a file per sweep and common pose files.
 
 use std::fmt::Debug;
 use std::path::{Path, PathBuf};
@@ -10,12 +10,12 @@ use super::disk::{Unfinished, make_folder, make_fresh_folder, write_file, write_
 use super::{Moment, Omissions, SceneHeader, SceneWriter, locked};
 use crate::generate::error::SynthError;
 
-/// Between the clocks of two scenes, microseconds: a day.
+/// Offset between the clocks of two scenes, microseconds: a day.
 const DAY_MICROS: u64 = 86_400_000_000;
 
-/// In what these layouts differ.
+/// Differences between these layouts.
 pub(super) trait Style: Debug + Send + Sync {
-    /// Time stamps of the first scene count from here on, microseconds.
+    /// Time stamps of the first scene start here, microseconds.
     fn epoch_micros(&self) -> u64;
 
     /// The folder of a sequence below the root.
@@ -24,13 +24,13 @@ pub(super) trait Style: Debug + Send + Sync {
     /// The folder of the sweeps below that of the sequence.
     fn sweeps_folder(&self) -> &'static str;
 
-    /// The name of a sweep's file, by number of its moment and its time.
+    /// The name of a sweep's file, by index of its capture time and its time stamp.
     fn file_name(&self, moment: usize, micros: u64) -> String;
 
     /// The bytes of a sweep.
     fn points(&self, points: &[[f32; 4]], omitted: &Omissions) -> Vec<u8>;
 
-    /// Writes what belongs to all sweeps of a sequence.
+    /// Writes the data common to all sweeps of a sequence.
     fn write_poses(&self, root: &Path, sequence: &Sequence<'_>) -> Result<(), SynthError>;
 }
 
@@ -42,7 +42,7 @@ pub(super) struct Sequence<'a> {
     pub(super) number: usize,
     /// Capture times of the scene's moments, nanoseconds.
     pub(super) capture_nanos: &'a [u64],
-    /// In order of time.
+    /// Sweeps by rising time.
     pub(super) sweeps: &'a [SweepPose],
 }
 
@@ -137,12 +137,12 @@ pub(super) fn date(first_year: usize, number: usize) -> [usize; 3] {
     [first_year + number / (12 * 28), 1 + number / 28 % 12, 1 + number % 28]
 }
 
-/// Points of ours in axes with y to the right and z down, as NCLT and Oxford have them.
+/// Points in axes with y to the right and z down, as in NCLT and Oxford.
 pub(super) fn z_down([x, y, z, intensity]: [f32; 4]) -> [f32; 4] {
     [x, -y, -z, intensity]
 }
 
-/// A pose of ours in such axes, of the sensor and of the world.
+/// A pose in such axes, of the sensor and of the world.
 pub(super) fn pose_z_down(pose: &Pose) -> Pose {
     let ([x, y, z], [qw, qx, qy, qz]) = (pose.translation_m, pose.rotation_wxyz);
     // Half a turn about x on either side.

@@ -1,5 +1,5 @@
-//! V2V4Real: the folders of OPV2V, right-handed. Poses are 4x4 matrices that PyYAML pickled from NumPy, objects stand in the
-//! frame of the agent's own LiDAR, and `ass_id` is the id that agents share.
+//! V2V4Real: the folders of OPV2V, right-handed. Poses are 4x4 matrices that PyYAML pickled from NumPy, objects stand
+//! in the frame of the agent's own LiDAR, and `ass_id` is the id that agents share.
 
 use std::fmt::Write as _;
 use std::path::Path;
@@ -60,7 +60,7 @@ fn write_files(folders: &AgentFolders, moment: &Moment, frame: &AgentFrame) -> R
     let points = pcd::encode(&frame.frame.points, Encoding::Binary, IntensityField::Intensity);
     write_file(&folders.file(moment, frame, ".pcd"), points)?;
     let mut yaml = String::with_capacity(2048 + 400 * frame.frame.objects.len());
-    write_frame(&mut yaml, frame).expect("a String takes all that is written to it");
+    write_frame(&mut yaml, frame).expect("writing to a String cannot fail");
     write_file(&folders.file(moment, frame, ".yaml"), yaml)
 }
 

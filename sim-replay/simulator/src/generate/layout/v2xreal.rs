@@ -22,7 +22,7 @@ fn write_files(folders: &AgentFolders, moment: &Moment, frame: &AgentFrame) -> R
     let points = float_bytes(frame.frame.points.xyzi.iter().copied());
     write_file(&folders.file(moment, frame, ".bin"), points)?;
     let mut yaml = String::with_capacity(512 + 400 * frame.frame.objects.len());
-    write_frame(&mut yaml, frame).expect("a String takes all that is written to it");
+    write_frame(&mut yaml, frame).expect("writing to a String cannot fail");
     write_file(&folders.file(moment, frame, ".yaml"), yaml)
 }
 

@@ -10,7 +10,7 @@ use dataset::frame::Object;
 
 /// Kilometres per hour in a metre per second.
 pub(super) const KMH_PER_MPS: f64 = 3.6;
-/// The first number of vehicles that have to be named anew.
+/// First number for vehicles that need a new name.
 const FIRST_VEHICLE: usize = 1001;
 
 /// A list of numbers below a key.
@@ -26,11 +26,11 @@ pub(super) struct ObjectEntry<'a> {
     /// Roll, yaw, pitch, degrees.
     pub(super) angle_deg: [f64; 3],
     pub(super) location_m: [f64; 3],
-    /// From the location to the centre of the box, added without being turned.
+    /// Offset from the location to the centre of the box, added without rotation.
     pub(super) center_m: [f64; 3],
     pub(super) size_m: [f64; 3],
     pub(super) speed_mps: Option<f64>,
-    /// Keys and values that only one layout has, in alphabetical order behind `angle`.
+    /// Keys and values of one layout only, in alphabetical order after `angle`.
     pub(super) more: &'a [(&'static str, String)],
 }
 
@@ -57,7 +57,7 @@ impl ObjectEntry<'_> {
     }
 }
 
-/// Where the objects of a frame stand: as the simulation knows it, else the middle of the box's bottom face.
+/// Reference points of the objects of a frame: from the simulation if known, else the centre of the box's bottom face.
 pub(super) fn anchors(frame: &AgentFrame) -> Vec<BoxAnchor> {
     match &frame.simulated {
         Some(simulated) => simulated.anchors.clone(),
@@ -72,7 +72,7 @@ fn bottom_anchor(object: &Object) -> BoxAnchor {
     BoxAnchor { location_m: std::array::from_fn(|axis| translation_m[axis] - center_offset_m[axis]), center_offset_m }
 }
 
-/// The folders of a scene's agents. Readers take them in text order, roadside units (negative numbers) last: where the
+/// The folders of a scene's agents. Readers sort them as text, roadside units (negative numbers) last: where the
 /// agents' own names are not such numbers, they are numbered.
 pub(super) fn agent_folders(scene: &SceneHeader) -> Vec<String> {
     let own: Vec<String> = scene.agents.iter().map(|agent| agent.id.as_str().to_owned()).collect();

@@ -6,31 +6,31 @@ use nalgebra::{Matrix3, Vector3};
 
 use super::placement::{Placement, Sweep};
 
-/// Which rays a sensor casts in one sweep: columns at even azimuths, each with the same even elevations.
+/// Rays of a sensor in one sweep: columns at even azimuths, each with the same even elevations.
 ///
 /// The rays of one column share one origin and lie in one plane, so most of an intersection is done once a column.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RayPattern {
     /// Azimuth of the first column, radians.
     pub first_azimuth_rad: f32,
-    /// From one column to the next, radians; negative turns clockwise seen from above.
+    /// Step from one column to the next, radians; negative turns clockwise seen from above.
     pub azimuth_step_rad: f32,
     /// Number of columns.
     pub columns: usize,
     /// Elevation of the first channel, radians.
     pub first_elevation_rad: f32,
-    /// From one channel to the next, radians, positive.
+    /// Step from one channel to the next, radians, positive.
     pub elevation_step_rad: f32,
     /// Number of channels.
     pub channels: usize,
-    /// Nothing farther is hit, metres.
+    /// Largest range of a hit, metres.
     pub range_m: f32,
-    /// Whether the columns are measured one after another over the sweep, the last one at its end, or all at its end.
+    /// True if the columns are measured one after another over the sweep, the last one at its end, or all at its end.
     pub rolling: bool,
 }
 
 impl RayPattern {
-    /// Whether the columns go all the way round.
+    /// True if the columns go all the way round.
     #[must_use]
     pub fn is_full_turn(&self) -> bool {
         self.azimuth_step_rad.abs() * self.columns as f32 > TAU - 0.5 * self.azimuth_step_rad.abs()
@@ -48,7 +48,7 @@ impl RayPattern {
         self.first_elevation_rad + self.elevation_step_rad * channel as f32
     }
 
-    /// When a column is measured: 0 at the start of the sweep, 1 at its end.
+    /// Time at which a column is measured: 0 at the start of the sweep, 1 at its end.
     #[must_use]
     pub fn time(&self, column: usize) -> f64 {
         if self.rolling { (column + 1) as f64 / self.columns as f64 } else { 1.0 }
@@ -66,7 +66,7 @@ pub(super) struct ColumnRays<'a> {
 }
 
 impl ColumnRays<'_> {
-    /// The first `count` rays; tells the compiler that all slices of a kernel are as long.
+    /// The first `count` rays; lets the compiler assume that all slices of a kernel have this length.
     #[inline]
     pub(super) fn cut(&self, count: usize) -> Self {
         Self { cos: &self.cos[..count], sin: &self.sin[..count], ..*self }
@@ -80,7 +80,8 @@ impl ColumnRays<'_> {
     }
 }
 
-/// Where the sensor is and looks at one column, relative to a point near the sensor (so that `f32` is exact enough).
+/// Position and direction of the sensor at one column, relative to a point near the sensor (so that `f32` is exact
+/// enough).
 #[derive(Debug, Clone, Copy)]
 pub(super) struct ColumnPose {
     pub(super) time: f32,

@@ -1,4 +1,4 @@
-//! Which rays of a sweep can meet a body at all.
+//! Footprint of a body: the rays of a sweep that can hit it.
 
 use std::f32::consts::{PI, TAU};
 use std::ops::Range;
@@ -11,17 +11,17 @@ use super::{Body, Bounds};
 
 /// Closer than this, metres, a body may be seen in every direction.
 const TOUCHING_M: f32 = 0.3;
-/// What the straight line between two places leaves out of a turning motion of 50 ms, metres.
+/// Deviation of a turning motion of 50 ms from the straight line between its ends, metres.
 const BEND_M: f32 = 0.05;
 
-/// The columns and channels which can meet a body, never fewer than those which do.
+/// The columns and channels which can hit a body, a superset of those which do.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Footprint {
-    /// First column; may lie before 0 or go on past the last where the pattern goes all the way round.
+    /// First column; may be below 0, or the range may exceed the last column, if the pattern covers a full turn.
     pub(super) first_column: i64,
     pub(super) columns: usize,
     pub(super) channels: Range<usize>,
-    /// No hit is nearer, metres.
+    /// Lower bound of the distance of a hit, metres.
     pub(super) nearest_m: f32,
 }
 
@@ -36,7 +36,7 @@ impl SensorFrames {
         Self { ends: [frame(&sensor.start), frame(&sensor.end)] }
     }
 
-    /// The footprint of `body`, or nothing where it is out of range or out of sight.
+    /// The footprint of `body`, or nothing if it is out of range or outside the field of view.
     ///
     /// Bounded by the corners of the body's box at both ends of the sweep: between them the motion is straight up to
     /// [`BEND_M`], so the body stays in their convex hull.
@@ -60,11 +60,11 @@ impl SensorFrames {
         Some(Footprint { first_column, columns, channels, nearest_m })
     }
 
-    /// The cheap question first: most of what stands in a town is too far away.
+    /// Cheap early test: most bodies of a scene are too far away.
     fn is_surely_out_of_range(&self, range_m: f32, body: &Body<'_>) -> bool {
         let [near_x, near_y] =
             [0, 1].map(|axis: usize| body.shape.bounds.min_m[axis].abs().max(body.shape.bounds.max_m[axis].abs()));
-        // Both ends may lie a sweep's motion apart, and a little more than that is in no way wrong.
+        // Both ends may be a sweep's motion apart; the margin is conservative.
         let reach_m = f64::from(range_m + near_x + near_y) + 10.0;
         let offset = body.motion.end.position_m - self.ends[1].1;
         offset.x * offset.x + offset.y * offset.y > reach_m * reach_m
@@ -85,7 +85,7 @@ impl SensorFrames {
         })
     }
 
-    /// A lower bound of the horizontal distance: the best of a few lines that part the sensor from the corners.
+    /// A lower bound of the horizontal distance: the best of a few lines that separate the sensor from the corners.
     fn nearest(&self, motion: &Sweep, flat: &[Vector2<f32>; 16], center: &Vector2<f32>) -> f32 {
         let axes: Matrix3<f32> = (self.ends[1].0 * motion.end.rotation()).cast();
         let closest = flat.iter().min_by(|a, b| a.norm_squared().total_cmp(&b.norm_squared())).unwrap_or(center);
@@ -99,7 +99,7 @@ impl SensorFrames {
     }
 }
 
-/// The channels between the lowest and the highest elevation under which a corner's height can be seen.
+/// The channels between the lowest and the highest elevation at which a corner's height can be seen.
 fn channels(pattern: &RayPattern, corners: &[Vector3<f32>; 16], nearest_m: f32) -> Option<Range<usize>> {
     let farthest_m = corners.iter().map(|corner| corner.xy().norm()).fold(0.0, f32::max) + BEND_M;
     let low = corners.iter().map(|corner| corner.z).fold(f32::MAX, f32::min) - BEND_M;
@@ -122,7 +122,7 @@ fn columns(
     let middle = center.y.atan2(center.x);
     let (mut low, mut high) = (0.0f32, 0.0f32);
     for corner in flat {
-        // The hull does not hold the sensor, so all azimuths lie within half a turn of the middle one.
+        // The hull does not contain the sensor, so all azimuths lie within half a turn of the central one.
         let aside = corner.y * center.x - corner.x * center.y;
         let delta = aside.atan2(corner.dot(center));
         (low, high) = (low.min(delta), high.max(delta));

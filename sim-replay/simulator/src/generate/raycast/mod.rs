@@ -1,9 +1,10 @@
 //! Ray casting for scanning sensors.
 //!
-//! Everything that can be hit is a body of convex parts, or the ground. A sweep is drawn like a picture with a depth
-//! buffer: each body is projected to the columns and channels that can meet it, and exactly those rays are intersected,
-//! without approximation, at the time at which their column is measured. For a spinning LiDAR this beats a tree per ray:
-//! neighbouring rays share nearly all of the work, and the loops over the channels of a column are vector code.
+//! Targets are bodies of convex parts, and the ground. A sweep is rendered like an image with a depth buffer: each body
+//! is projected to the columns and channels that can hit it, and exactly those rays are intersected, without
+//! approximation, at the time at which their column is measured. For a spinning LiDAR this is faster than a tree
+//! traversal per ray: neighbouring rays share nearly all of the work, and the loops over the channels of a column are
+//! vector code.
 
 mod column;
 mod footprint;
@@ -21,19 +22,19 @@ use nalgebra::{Matrix3, Vector3};
 use column::{ColumnPose, ColumnRays};
 use footprint::{Footprint, SensorFrames};
 
-/// [`RangeImage::hits`] of a ray that met nothing.
+/// [`RangeImage::hits`] of a ray without a hit.
 pub const MISS: u32 = u32::MAX;
-/// [`RangeImage::hits`] of a ray that met the ground.
+/// [`RangeImage::hits`] of a ray that hit the ground.
 pub const GROUND: u32 = u32::MAX - 1;
 
-/// What a body looks like: convex parts in its own frame.
+/// Geometry of a body: convex parts in its own frame.
 #[derive(Debug, Clone, PartialEq)]
 pub struct BodyShape {
     /// The parts; they may overlap.
     pub parts: Vec<Part>,
     /// The box around all parts.
     pub bounds: Bounds,
-    /// Share of the light that comes back, 0..1.
+    /// Reflectance, 0..1.
     pub reflectivity: f32,
 }
 
@@ -41,7 +42,7 @@ impl BodyShape {
     /// A shape of at least one part.
     ///
     /// # Panics
-    /// Where `parts` is empty: a body without extent is a mistake of the caller.
+    /// If `parts` is empty: a body without extent is an error of the caller.
     #[must_use]
     pub fn new(parts: Vec<Part>, reflectivity: f32) -> Self {
         let bounds = parts.iter().map(Part::bounds).reduce(|a, b| a.union(&b)).expect("a body has parts");
@@ -49,7 +50,7 @@ impl BodyShape {
     }
 }
 
-/// A shape and where it is during one sweep.
+/// A shape and its motion during one sweep.
 #[derive(Debug, Clone, Copy)]
 pub struct Body<'a> {
     /// Its form.
@@ -58,9 +59,9 @@ pub struct Body<'a> {
     pub motion: Sweep,
 }
 
-/// What lies under everything.
+/// The ground surface.
 pub trait Surface {
-    /// Shortens `depth` to the ground where rays meet it, and writes [`GROUND`] into `hit` there.
+    /// Shortens `depth` to the ground where rays hit it, and writes [`GROUND`] into `hit` there.
     ///
     /// Ray `i` leaves `origin` (world, metres) along `forward * cos[i] + up * sin[i]`, a unit vector.
     fn cast(&self, rays: &SurfaceRays<'_>, depth: &mut [f32], hit: &mut [u32]);
@@ -69,7 +70,7 @@ pub trait Surface {
 /// One column of rays in the world.
 #[derive(Debug, Clone, Copy)]
 pub struct SurfaceRays<'a> {
-    /// Where all rays begin, metres.
+    /// Common origin of the rays, metres.
     pub origin: Vector3<f64>,
     /// Direction at elevation 0.
     pub forward: Vector3<f32>,
@@ -97,14 +98,14 @@ impl Surface for Plane {
     }
 }
 
-/// Where one column was measured, seen from the sensor at the sweep's end.
+/// Pose of one column when it was measured, relative to the sensor at the sweep's end.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SkewedColumn {
-    /// Where the sensor was, metres.
+    /// Origin of the column, metres.
     pub origin_m: Vector3<f32>,
-    /// Where the column points at elevation 0.
+    /// Direction of the column at elevation 0.
     pub forward: Vector3<f32>,
-    /// Where it points at elevation 90 degrees.
+    /// Direction at elevation 90 degrees.
     pub up: Vector3<f32>,
 }
 
@@ -117,10 +118,10 @@ impl SkewedColumn {
     }
 }
 
-/// What the rays of one sweep met: `[columns, channels]`, the channels of a column side by side.
+/// Hits of one sweep: `[columns, channels]`, the channels of a column side by side.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct RangeImage {
-    /// Distance of the first hit, metres; the pattern's range where nothing was met.
+    /// Distance of the first hit, metres; the pattern's range where there is none.
     pub depths_m: Vec<f32>,
     /// Index into the bodies that were cast, [`GROUND`] or [`MISS`].
     pub hits: Vec<u32>,
@@ -158,7 +159,7 @@ impl Caster {
         &self.pattern
     }
 
-    /// Casts one sweep: `sensor` is `world_from_sensor` over it. Bodies around the sensor itself are seen through.
+    /// Casts one sweep: `sensor` is `world_from_sensor` over it. Bodies around the sensor itself are transparent.
     pub fn cast(&mut self, sensor: &Sweep, ground: &dyn Surface, bodies: &[Body<'_>]) -> &RangeImage {
         let anchor = sensor.end.position_m;
         let (pattern, channels) = (&self.pattern, self.pattern.channels);
@@ -180,7 +181,8 @@ impl Caster {
         self.order.clear();
         let visible = bodies.iter().enumerate();
         self.order.extend(visible.filter_map(|(index, body)| Some((frames.footprint(&self.pattern, body)?, index))));
-        // Near bodies first: what they hide need not be intersected. The index settles ties the same way every time.
+        // Near bodies first: bodies behind them need not be intersected. The index makes the order of ties
+        // deterministic.
         self.order.sort_unstable_by(|(a, i), (b, j)| a.nearest_m.total_cmp(&b.nearest_m).then(i.cmp(j)));
         for index in 0..self.order.len() {
             let (footprint, body) = self.order[index].clone();

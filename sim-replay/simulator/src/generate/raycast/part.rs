@@ -1,4 +1,4 @@
-//! Convex parts that bodies are made of, and the kernels that intersect one of them with a column of rays.
+//! Convex parts of bodies, and the kernels that intersect one of them with a column of rays.
 
 use super::column::ColumnRays;
 
@@ -78,7 +78,7 @@ impl Bounds {
         })
     }
 
-    /// Whether the plane through `origin` with unit normal `normal` touches the box.
+    /// True if the plane through `origin` with unit normal `normal` touches the box.
     fn meets_plane(&self, origin: &[f32; 3], normal: &[f32; 3]) -> bool {
         let (mut distance, mut reach) = (0.0f32, 1e-3f32);
         for axis in 0..3 {
@@ -130,7 +130,7 @@ impl Part {
     }
 }
 
-/// Takes the entry into a solid as the new depth where it lies before the old one.
+/// Replaces the depth by the entry into a solid where that is nearer.
 ///
 /// Written with selects instead of a branch so that the loops around it become vector code.
 #[inline(always)]

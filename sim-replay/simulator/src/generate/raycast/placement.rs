@@ -1,9 +1,10 @@
-//! Where things are during one sweep.
+//! Placements and motions of bodies and sensors during one sweep.
 
 use nalgebra::{Isometry3, Matrix3, Rotation3, Translation3, UnitQuaternion, Vector3};
 use std::f64::consts::{PI, TAU};
 
-/// A pose: position in metres, heading, pitch (positive lifts the nose) and roll (positive lifts the left side), radians.
+/// A pose: position in metres, heading, pitch (positive lifts the nose) and roll (positive lifts the left side),
+/// radians.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Placement {
     /// Position in the world.
@@ -66,7 +67,7 @@ impl Sweep {
         Self { start: placement, end: placement }
     }
 
-    /// Whether nothing moves.
+    /// True if start and end are the same.
     #[must_use]
     pub fn is_still(&self) -> bool {
         self.start == self.end

@@ -191,7 +191,8 @@ fn check_against_brute_force(pattern: RayPattern, seeds: std::ops::Range<u64>, r
             rays += 1;
             on_bodies += usize::from(expected.hits[ray] < GROUND);
             let error = (image.depths_m[ray] - expected.depths_m[ray]).abs();
-            // Rays that graze an edge may fall on either side of it in `f32`; they are counted, not exempted one by one.
+            // Rays that graze an edge may fall on either side of it in `f32`; they are counted, not exempted one by
+            // one.
             silhouettes += usize::from(error > 2e-3 || image.hits[ray] != expected.hits[ray]);
         }
     }

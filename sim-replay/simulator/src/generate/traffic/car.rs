@@ -12,25 +12,25 @@ use crate::map::LaneId;
 /// One vehicle in traffic.
 #[derive(Debug, Clone)]
 pub(crate) struct Car {
-    /// Changes when the vehicle leaves the scene and another one takes its place.
+    /// Changes when the vehicle leaves the scene and another one replaces it.
     pub(crate) id: i64,
     pub(crate) vehicle: Vehicle,
     pub(crate) driver: Driver,
     pub(crate) path: Path,
-    /// How far left of the lane's middle it drives, metres.
+    /// Offset to the left of the lane's centre line, metres.
     pub(crate) aside_m: f64,
     pub(crate) speed_mps: f64,
-    /// Who was ahead in the last step.
+    /// Obstacle ahead in the last step.
     pub(crate) leader: Option<Obstacle>,
-    /// Whether it would rather be on another lane.
-    pub(crate) lane_mood: LaneChangeState,
+    /// State of the lane-change model.
+    pub(crate) lane_change: LaneChangeState,
     /// The motion of the last step.
     pub(crate) motion: Sweep,
-    /// Whether it is part of the scene.
+    /// True if it is part of the scene.
     pub(crate) is_present: bool,
-    /// How long it has been standing, seconds.
+    /// Duration of the current stop, seconds.
     pub(crate) standing_s: f64,
-    /// Lanes of junctions that it may use.
+    /// Junction lanes reserved for it.
     pub(crate) held: Vec<LaneId>,
 }
 
@@ -43,7 +43,7 @@ impl Car {
         0.6 * self.vehicle.size_m[0]
     }
 
-    /// Where it stands after `drive_m` more metres of its way.
+    /// Placement after `drive_m` more metres of its path.
     pub(crate) fn placement_after(&self, roads: &Roads<'_>, drive_m: f64) -> Placement {
         self.path.placement(roads.graph, drive_m, self.wheelbase_m(), self.aside_m)
     }
@@ -53,7 +53,7 @@ impl Car {
         Rectangle::new(&self.motion.end, &self.vehicle.size_m)
     }
 
-    /// Its place in the plane now, metres.
+    /// Its position in the plane now, metres.
     pub(crate) fn point_m(&self) -> [f64; 2] {
         self.motion.end.position_m.xy().into()
     }

@@ -1,16 +1,16 @@
-//! How a driver chooses speed: the Intelligent Driver Model (Treiber, Hennecke and Helbing 2000) and bends.
+//! Longitudinal driver model: the Intelligent Driver Model (Treiber, Hennecke and Helbing 2000) and speed in bends.
 
 use crate::map::Lane;
 use support::random::SplitMix64;
 
-/// Sideways acceleration that drivers accept in bends, metres per second squared.
+/// Lateral acceleration that drivers accept in bends, metres per second squared.
 const SIDEWAYS_MPS2: f64 = 2.2;
-/// Slower than this nobody takes a bend, metres per second.
+/// Lowest speed in a bend, metres per second.
 const CRAWL_MPS: f64 = 2.5;
 /// Hardest braking, metres per second squared.
 const EMERGENCY_MPS2: f64 = 8.0;
 
-/// What tells one driver from another.
+/// Parameters of one driver.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Driver {
     /// Share of the speed limit driven on a free road.
@@ -21,21 +21,21 @@ pub(crate) struct Driver {
     jam_gap_m: f64,
     /// Acceleration from standing, metres per second squared.
     acceleration_mps2: f64,
-    /// Braking that is felt as comfortable, metres per second squared.
+    /// Comfortable deceleration, metres per second squared.
     pub(crate) comfort_mps2: f64,
 }
 
-/// Something ahead that must not be reached.
+/// An obstacle ahead.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Obstacle {
     /// Free distance from bumper to bumper (or line), metres.
     pub(crate) gap_m: f64,
-    /// How fast it moves away, metres per second.
+    /// Its speed away from the vehicle, metres per second.
     pub(crate) speed_mps: f64,
 }
 
 impl Driver {
-    /// Somebody.
+    /// A driver with random parameters.
     pub(crate) fn random(random: &mut SplitMix64) -> Self {
         Self {
             pace: random.between(0.75, 1.1),
@@ -46,13 +46,13 @@ impl Driver {
         }
     }
 
-    /// Acceleration at `speed_mps` when `wanted_mps` is wanted, metres per second squared.
+    /// Acceleration at `speed_mps` for a desired speed of `wanted_mps`, metres per second squared.
     pub(crate) fn acceleration_mps2(&self, speed_mps: f64, wanted_mps: f64, obstacles: &[Obstacle]) -> f64 {
         let wanted = wanted_mps.max(0.1);
         let free = if speed_mps <= wanted {
             self.acceleration_mps2 * (1.0 - (speed_mps / wanted).powi(4))
         } else {
-            // The model's own term brakes far harder than anybody before a mere bend.
+            // The model's own term brakes far too hard before a mere bend.
             -self.comfort_mps2 * (1.0 - wanted / speed_mps).max(0.0).sqrt() * 1.5
         };
         let most = obstacles.iter().map(|obstacle| self.interaction(speed_mps, obstacle)).fold(0.0, f64::max);
@@ -67,7 +67,7 @@ impl Driver {
     }
 }
 
-/// The fastest speed at each point of a lane's centre line: its limit, or less where it bends, metres per second.
+/// The highest speed at each point of a lane's centre line: its limit, or less where it bends, metres per second.
 pub(crate) fn bend_speeds_mps(lane: &Lane) -> Vec<f32> {
     // Over 3 m to either side, since the corner between two points of the line is no bend by itself.
     const REACH: usize = 3;

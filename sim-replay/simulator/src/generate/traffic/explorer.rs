@@ -1,4 +1,4 @@
-//! A focus that wants to know the whole town: always towards the nearest road where it has been least often.
+//! Exploring focus vehicle: drives towards the nearest road with the fewest visits.
 
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
@@ -7,25 +7,26 @@ use super::lane_change::Side;
 use super::roads::Roads;
 use crate::map::LaneId;
 
-/// What a change of lanes counts for on the way somewhere, metres.
+/// Cost of a lane change in the search for a route, metres.
 const CHANGE_M: u64 = 100;
-/// Shorter lanes are no roads to look for, metres.
+/// Shorter lanes are not targets, metres.
 const SHORTEST_M: f64 = 5.0;
 
-/// How often each lane was chosen, and how far the least known ones are from everywhere.
+/// Visits of each lane, and the distance to the least visited ones.
 #[derive(Debug)]
 pub(super) struct Explorer {
-    /// Lanes from which one comes onto a lane, each with what that costs, metres.
+    /// Lanes from which a lane can be reached, each with the cost, metres.
     onto: Vec<Vec<(LaneId, u64)>>,
-    /// Whether a lane is worth looking for.
+    /// True if a lane is a target of exploration.
     is_road: Vec<bool>,
     visits: Vec<u32>,
-    /// From the beginning of each lane to the nearest least known one, metres; none where none can be reached.
+    /// Distance from the beginning of each lane to the nearest least visited one, metres; `None` if none can be
+    /// reached.
     unknown_m: Vec<Option<u64>>,
 }
 
 impl Explorer {
-    /// Nothing is known but the lane it starts on.
+    /// No lane is visited except the one it starts on.
     pub(super) fn new(roads: &Roads<'_>, start: LaneId) -> Self {
         let lanes = &roads.graph.lanes;
         let mut onto = vec![Vec::new(); lanes.len()];
@@ -46,20 +47,20 @@ impl Explorer {
         explorer
     }
 
-    /// A lane was chosen.
+    /// Counts the choice of a lane.
     pub(super) fn choose(&mut self, lane: LaneId) {
         self.visits[lane.0 as usize] += 1;
         self.unknown_m.clear();
     }
 
-    /// A lane that was chosen will not be driven.
+    /// Undoes the choice of a lane that will not be driven.
     pub(super) fn give_up(&mut self, lane: LaneId) {
         let visits = &mut self.visits[lane.0 as usize];
         *visits = visits.saturating_sub(1);
         self.unknown_m.clear();
     }
 
-    /// Keeps the lanes that lead to the unknown soonest.
+    /// Keeps the lanes with the shortest distance to a least visited one.
     pub(super) fn keep_best(&mut self, lanes: &mut Vec<LaneId>) {
         let distances: Vec<Option<u64>> = lanes.iter().map(|&lane| self.unknown_m(lane)).collect();
         let Some(least) = distances.iter().flatten().min() else { return };
@@ -67,7 +68,7 @@ impl Explorer {
         lanes.retain(|_| distances.next().is_some_and(|distance| distance.as_ref() == Some(least)));
     }
 
-    /// Whether the lane `beside` is worth the change from `own`.
+    /// True if the lane `beside` justifies the change from `own`.
     pub(super) fn prefers(&mut self, beside: LaneId, own: LaneId) -> bool {
         match (self.unknown_m(beside), self.unknown_m(own)) {
             (Some(beside), Some(own)) => beside + CHANGE_M <= own,
@@ -82,7 +83,7 @@ impl Explorer {
         self.unknown_m[lane.0 as usize]
     }
 
-    /// Dijkstra's algorithm, backwards from all lanes that are least known.
+    /// Dijkstra's algorithm, backwards from all least visited lanes.
     fn look_around(&self) -> Vec<Option<u64>> {
         let roads = || (0..self.visits.len()).filter(|&lane| self.is_road[lane]);
         let fewest = roads().map(|lane| self.visits[lane]).min();
@@ -106,7 +107,7 @@ mod tests {
     use crate::map::{TownSource, build};
 
     #[test]
-    fn a_town_is_known_after_a_tour() {
+    fn a_tour_visits_the_whole_map() {
         let town = build(&TownSource::Town4, 0).unwrap();
         let roads = Roads::new(&town.lanes);
         let mut lane = roads.spawns[0].lane;
@@ -115,7 +116,7 @@ mod tests {
         for _ in 0..4 * count {
             let mut onward = roads.onward(lane);
             explorer.keep_best(&mut onward);
-            // Whoever drives changes lanes where it pays.
+            // Lane changes are part of the route where they shorten it.
             let beside = [Side::Left, Side::Right].into_iter().filter_map(|side| side.of(town.lanes.lane(lane)));
             lane = beside.into_iter().find(|&beside| explorer.prefers(beside, lane)).unwrap_or(onward[0]);
             explorer.choose(lane);

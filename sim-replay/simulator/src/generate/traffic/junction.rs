@@ -1,10 +1,10 @@
-//! Who may enter a junction: a lane is taken by those who use it, and closed while a lane that conflicts is taken.
+//! Junction reservations: a lane is held by the vehicles that use it, and closed while a conflicting lane is held.
 
 use super::car::Car;
 use super::roads::Roads;
 use crate::map::LaneId;
 
-/// Which vehicles hold which lanes of junctions.
+/// Vehicles that hold junction lanes, by lane.
 #[derive(Debug, Default)]
 pub(crate) struct RightOfWay {
     holders: Vec<Vec<u32>>,
@@ -15,7 +15,7 @@ impl RightOfWay {
         Self { holders: vec![Vec::new(); lanes] }
     }
 
-    /// Takes a lane for a vehicle, unless another one holds a lane that conflicts with it.
+    /// Reserves a lane for a vehicle, unless another one holds a conflicting lane.
     pub(crate) fn take(&mut self, index: u32, car: &mut Car, lane: LaneId, roads: &Roads<'_>) -> bool {
         if car.held.contains(&lane) {
             return true;
@@ -29,7 +29,7 @@ impl RightOfWay {
         true
     }
 
-    /// Gives back the lanes that a vehicle has left with its tail.
+    /// Releases the lanes that a vehicle has left completely.
     pub(crate) fn release_behind(&mut self, index: u32, car: &mut Car, roads: &Roads<'_>) {
         if car.held.is_empty() {
             return;

@@ -1,4 +1,4 @@
-//! Who changes lanes, and when: the wish, the gain and the safety rule of MOBIL (Kesting, Treiber and Helbing 2007).
+//! Lane changes: incentive, gain and safety criterion of MOBIL (Kesting, Treiber and Helbing 2007).
 
 use super::car::Car;
 use super::driver::Obstacle;
@@ -11,28 +11,28 @@ use support::random::SplitMix64;
 
 /// Duration of a change at an even speed, seconds.
 const CHANGE_S: f64 = 4.5;
-/// Shortest way in which a change is driven, metres.
+/// Shortest distance over which a change is driven, metres.
 const CHANGE_LEAST_M: f64 = 22.0;
-/// Slower than this nobody begins a change, metres per second.
+/// Lowest speed at which a change begins, metres per second.
 const LEAST_SPEED_MPS: f64 = 2.5;
-/// Who has been behind somebody slower for this long wants to get past, seconds.
+/// Time behind a slower vehicle after which a driver wants to overtake, seconds.
 const PATIENCE_S: f64 = 3.0;
-/// After a change the patience begins this much below zero, seconds.
+/// After a change the time behind a slower vehicle starts this much below zero, seconds.
 const REST_S: f64 = 8.0;
-/// Somebody slower: less than this share of the speed that the driver would like.
+/// A vehicle ahead is slower if it drives less than this share of the driver's desired speed.
 const SLOW_SHARE: f64 = 0.8;
-/// A change must win at least this much acceleration, metres per second squared.
+/// A change must gain at least this much acceleration, metres per second squared.
 const GAIN_MPS2: f64 = 0.3;
-/// Nobody is made to brake harder than this by a change, metres per second squared.
+/// Strongest braking that a change may impose on others, metres per second squared.
 const SAFE_MPS2: f64 = 2.0;
 /// Least gap before and behind on the new lane, metres.
 const SAFE_GAP_M: f64 = 2.5;
-/// Followers on the new lane are looked for this far behind, metres.
+/// Followers on the new lane are searched this far behind, metres.
 const BEHIND_M: f64 = 60.0;
-/// How long a wish without need is kept, seconds.
-const WHIM_S: f64 = 8.0;
-/// An exploring focus changes this often where nothing speaks for either lane.
-const WHIM_SHARE: f64 = 0.25;
+/// Duration for which a random wish to change is kept, seconds.
+const RANDOM_CHANGE_S: f64 = 8.0;
+/// Probability of a random change of an exploring focus where neither lane is better.
+const RANDOM_CHANGE_SHARE: f64 = 0.25;
 /// Neighbours whose lengths differ by more than this share lie in a bend too tight for a change.
 const LENGTH_SHARE: f64 = 0.04;
 /// Narrower lanes are not changed to, metres.
@@ -61,67 +61,67 @@ impl Side {
     }
 }
 
-/// What makes a driver think of another lane.
+/// State of a driver's wish to change lanes.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct LaneChangeState {
-    /// How long there has been somebody slower ahead, seconds.
+    /// Time behind a slower vehicle ahead, seconds.
     held_up_s: f64,
-    /// The side wanted without need.
+    /// Side of a random change.
     random_change: Option<Side>,
-    /// Time until the random_change passes, or until there may be the next one, seconds.
-    whim_turns_in_s: f64,
+    /// Time until the random change expires, or until the next one may start, seconds.
+    random_change_timer_s: f64,
 }
 
 impl LaneChangeState {
     pub(crate) fn random(random: &mut SplitMix64) -> Self {
-        Self { held_up_s: 0.0, random_change: None, whim_turns_in_s: random.between(0.0, 50.0) }
+        Self { held_up_s: 0.0, random_change: None, random_change_timer_s: random.between(0.0, 50.0) }
     }
 }
 
-/// Why a driver changes.
+/// Reason of a change.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Reason {
-    /// The lane ends and the other one goes on.
+    /// The lane ends and the other one continues.
     LaneEnds,
-    /// Somebody slower is ahead.
+    /// A slower vehicle is ahead.
     HeldUp,
-    /// Habit, or curiosity.
-    Whim,
+    /// Random change, or exploration.
+    Random,
 }
 
 impl Traffic<'_> {
-    /// Begins the changes that are wanted, possible and safe. Needs the list of occupants, and keeps it true.
+    /// Begins the changes that are wanted, possible and safe. Needs the list of occupants, and keeps it up to date.
     pub(super) fn change_lanes(&mut self, near: &mut Vec<u32>) {
         for index in 0..self.cars.len() {
             if !self.cars[index].is_present {
                 continue;
             }
-            self.turn_mood(index);
+            self.update_state(index);
             if let Some(path) = self.wanted_change(index, near) {
                 self.begin_change(index, path);
             }
         }
     }
 
-    fn turn_mood(&mut self, index: usize) {
+    fn update_state(&mut self, index: usize) {
         let car = &mut self.cars[index];
         let is_held_up = is_held_up(car, self.roads);
-        let mood = &mut car.lane_mood;
-        // The rest after a change passes in any case.
-        let is_rising = is_held_up || mood.held_up_s < 0.0;
-        mood.held_up_s = if is_rising { mood.held_up_s + STEP_S } else { (mood.held_up_s - STEP_S).max(0.0) };
-        mood.whim_turns_in_s -= STEP_S;
-        if mood.whim_turns_in_s > 0.0 {
+        let state = &mut car.lane_change;
+        // The waiting time after a change elapses in any case.
+        let is_rising = is_held_up || state.held_up_s < 0.0;
+        state.held_up_s = if is_rising { state.held_up_s + STEP_S } else { (state.held_up_s - STEP_S).max(0.0) };
+        state.random_change_timer_s -= STEP_S;
+        if state.random_change_timer_s > 0.0 {
             return;
         }
-        // A random_change passes; after the pause there may be another one.
-        let random_change = if mood.random_change.is_some() { None } else { self.random_change(index) };
-        let turns_in_s = if random_change.is_some() { WHIM_S } else { self.time_to_whim_s(index) };
-        let mood = &mut self.cars[index].lane_mood;
-        (mood.random_change, mood.whim_turns_in_s) = (random_change, turns_in_s);
+        // A random change expires; after the pause there may be another one.
+        let random_change = if state.random_change.is_some() { None } else { self.random_change(index) };
+        let turns_in_s = if random_change.is_some() { RANDOM_CHANGE_S } else { self.time_to_random_change_s(index) };
+        let state = &mut self.cars[index].lane_change;
+        (state.random_change, state.random_change_timer_s) = (random_change, turns_in_s);
     }
 
-    fn time_to_whim_s(&mut self, index: usize) -> f64 {
+    fn time_to_random_change_s(&mut self, index: usize) -> f64 {
         let [low, high] = if self.explores(index) { [4.0, 16.0] } else { [20.0, 80.0] };
         self.random.between(low, high)
     }
@@ -130,7 +130,7 @@ impl Traffic<'_> {
         index == 0 && self.options.focus_explores
     }
 
-    /// A side to change to without need; for an exploring focus, where that leads to the unknown.
+    /// Side of a random change; for an exploring focus, one that leads to less visited roads.
     fn random_change(&mut self, index: usize) -> Option<Side> {
         let own = self.cars[index].path.lane();
         let sides = [Side::Left, Side::Right];
@@ -140,7 +140,7 @@ impl Traffic<'_> {
         if let Some(explorer) = self.explorer.as_mut().filter(|_| index == 0) {
             let wanted = |&(_, lane): &(Side, LaneId)| explorer.prefers(lane, own);
             let better: Vec<_> = sides.iter().copied().filter(wanted).collect();
-            if better.is_empty() && !self.random.chance(WHIM_SHARE) {
+            if better.is_empty() && !self.random.chance(RANDOM_CHANGE_SHARE) {
                 return None;
             }
             if !better.is_empty() {
@@ -150,7 +150,7 @@ impl Traffic<'_> {
         Some(sides.get(self.random.below(sides.len()))?.0)
     }
 
-    /// The way after a change that may begin now.
+    /// The path after a change that may begin now.
     fn wanted_change(&self, index: usize, near: &mut Vec<u32>) -> Option<Path> {
         let car = &self.cars[index];
         if car.path.is_changing() || car.speed_mps < LEAST_SPEED_MPS {
@@ -170,13 +170,13 @@ impl Traffic<'_> {
         if !self.roads.is_endless(own) && self.roads.is_endless(other) {
             return Some(Reason::LaneEnds);
         }
-        if car.lane_mood.held_up_s > PATIENCE_S {
+        if car.lane_change.held_up_s > PATIENCE_S {
             return Some(Reason::HeldUp);
         }
-        (car.lane_mood.random_change == Some(side)).then_some(Reason::Whim)
+        (car.lane_change.random_change == Some(side)).then_some(Reason::Random)
     }
 
-    /// How much harder a driver could accelerate on another way, metres per second squared.
+    /// Gain in acceleration on another path, metres per second squared.
     fn gain_mps2(&self, index: usize, path: &Path) -> f64 {
         let car = &self.cars[index];
         let wanted_mps = free_speed_mps(car, self.roads);
@@ -185,7 +185,7 @@ impl Traffic<'_> {
         with(self.leader_on(index, path)) - with(car.leader)
     }
 
-    /// Whether a change disturbs nobody: the driver's own way past who is ahead now, and the gaps on the new lane.
+    /// True if a change is safe: the driver's own path past the vehicle ahead, and the gaps on the new lane.
     fn is_safe(&self, index: usize, path: &Path, near: &mut Vec<u32>) -> bool {
         let car = &self.cars[index];
         let is_clear_of = |leader: Obstacle| {
@@ -212,7 +212,7 @@ impl Traffic<'_> {
         if !follower.is_none_or(is_let_in) {
             return false;
         }
-        // Those that are on no list of the lane: who crosses it, or has all but left it.
+        // Vehicles that are not in the list of the lane: those that cross it, or have nearly left it.
         let beside =
             Path::new(path.lane(), path.s_m()).placement(self.roads.graph, 0.0, car.wheelbase_m(), car.aside_m);
         let mut room = Rectangle::new(&beside, &car.vehicle.size_m).grown(0.3);
@@ -220,10 +220,10 @@ impl Traffic<'_> {
         self.is_free(index, &room, near)
     }
 
-    /// Who comes next behind a place on a lane, and how far from middle to middle, metres.
+    /// The next follower behind a position on a lane, and the distance between the centres, metres.
     fn follower_on(&self, index: usize, lane: LaneId, s_m: f64) -> Option<(usize, f64)> {
         let mut nearest: Option<(usize, f64)> = None;
-        // Lanes yet to be looked at, and how far behind the place their ends are.
+        // Lanes still to be searched, and the distance of their ends behind the position.
         let mut open = vec![(lane, s_m - self.roads.graph.lane(lane).length_m)];
         while let Some((lane, end_m)) = open.pop() {
             let start_m = end_m + self.roads.graph.lane(lane).length_m;
@@ -245,9 +245,9 @@ impl Traffic<'_> {
     }
 
     fn begin_change(&mut self, index: usize, path: Path) {
-        let pause_s = self.time_to_whim_s(index);
+        let pause_s = self.time_to_random_change_s(index);
         let car = &mut self.cars[index];
-        car.lane_mood = LaneChangeState { held_up_s: -REST_S, random_change: None, whim_turns_in_s: pause_s };
+        car.lane_change = LaneChangeState { held_up_s: -REST_S, random_change: None, random_change_timer_s: pause_s };
         if let Some(explorer) = self.explorer.as_mut().filter(|_| index == 0) {
             // Lanes that were decided but will not be driven do not count.
             car.path.ahead(self.roads.graph).skip(1).for_each(|(lane, _)| explorer.give_up(lane));
@@ -261,7 +261,7 @@ impl Traffic<'_> {
     }
 }
 
-/// The speed that a driver would like here without anybody ahead, metres per second.
+/// The desired speed here without a vehicle ahead, metres per second.
 fn free_speed_mps(car: &Car, roads: &Roads<'_>) -> f64 {
     car.driver.pace * roads.speed_mps(car.path.lane(), car.path.s_m())
 }
@@ -277,7 +277,7 @@ fn change_m(car: &Car) -> f64 {
     (CHANGE_S * car.speed_mps).max(CHANGE_LEAST_M)
 }
 
-/// The way that goes on beside the present one, when the two lie side by side for as long as the change takes.
+/// The path beside the present one, if the two lie side by side for as long as the change takes.
 fn path_beside(car: &Car, side: Side, roads: &Roads<'_>) -> Option<Path> {
     let graph = roads.graph;
     let is_in_junction = |lane: LaneId| graph.lane(lane).in_junction;
@@ -307,7 +307,7 @@ fn path_beside(car: &Car, side: Side, roads: &Roads<'_>) -> Option<Path> {
     }
 }
 
-/// Whether a vehicle may drive from one neighbour to the other anywhere along them.
+/// True if a vehicle may change from one neighbour to the other anywhere along them.
 fn lies_beside(lane: LaneId, left: LaneId, roads: &Roads<'_>) -> bool {
     let (to, from) = (roads.graph.lane(lane), roads.graph.lane(left));
     let leads_on = roads.is_endless(lane) || !roads.is_endless(left);

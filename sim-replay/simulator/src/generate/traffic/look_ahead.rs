@@ -1,4 +1,4 @@
-//! What a driver sees on the way ahead, and how hard that makes them brake.
+//! Look-ahead: obstacles on the path ahead, and the acceleration that follows from them.
 
 use super::Traffic;
 use super::driver::Obstacle;
@@ -6,21 +6,21 @@ use super::path::Path;
 use crate::generate::raycast::wrapped;
 use crate::map::LaneId;
 
-/// Vehicles that stand longer than this stop waiting for those beside them, seconds.
+/// Vehicles that stand longer than this stop giving way to those beside them, seconds.
 const PATIENCE_S: f64 = 6.0;
-/// Free room beside the swept way in which nobody may be, metres.
+/// Free space required beside the swept path, metres.
 const SIDE_ROOM_M: f64 = 0.25;
-/// Distance between the looks along the swept way, metres.
+/// Distance between the samples along the swept path, metres.
 const SWEEP_STEP_M: f64 = 1.5;
-/// Where a vehicle stops before a junction, metres before its first lane.
+/// Distance of the stop line before the first lane of a junction, metres.
 const STOP_LINE_M: f64 = 0.8;
-/// After the junction there must be this much more than the vehicle's length, metres.
+/// Free length required after the junction beyond the vehicle's own, metres.
 const EXIT_ROOM_M: f64 = 3.0;
-/// Who leaves the room behind a junction faster than this need not have left it, metres per second.
+/// A vehicle in the space behind a junction that is faster than this counts as leaving it, metres per second.
 const MOVING_ON_MPS: f64 = 3.0;
 
 impl Traffic<'_> {
-    /// How a driver accelerates now, metres per second squared.
+    /// Acceleration of a driver now, metres per second squared.
     pub(super) fn acceleration_mps2(&mut self, index: usize, near: &mut Vec<u32>) -> f64 {
         let mut obstacles = Vec::with_capacity(4);
         let leader = self.leader_on(index, &self.cars[index].path);
@@ -34,7 +34,7 @@ impl Traffic<'_> {
         car.driver.acceleration_mps2(car.speed_mps, wanted, &obstacles)
     }
 
-    /// The speed that limits and bends ahead allow, metres per second.
+    /// The speed permitted by limits and bends ahead, metres per second.
     fn wanted_speed_mps(&self, index: usize) -> f64 {
         let car = &self.cars[index];
         let braking = 0.7 * car.driver.comfort_mps2;
@@ -55,7 +55,7 @@ impl Traffic<'_> {
         wanted
     }
 
-    /// The next vehicle on the lanes of a way from its present place on.
+    /// The next vehicle on the lanes of a path from its present position on.
     pub(super) fn leader_on(&self, index: usize, path: &Path) -> Option<Obstacle> {
         let car = &self.cars[index];
         let horizon_m = 30.0 + 3.0 * car.speed_mps;
@@ -63,7 +63,7 @@ impl Traffic<'_> {
             if start_m > horizon_m {
                 return None;
             }
-            // Those at the same place are parted by their index, as in the order of the list.
+            // Vehicles at the same position are ordered by index, as in the list.
             let is_ahead = |&&(s_m, other): &&(f64, u32)| {
                 other as usize != index && (start_m + s_m, other as usize) > (0.0, index)
             };
@@ -105,7 +105,7 @@ impl Traffic<'_> {
         None
     }
 
-    /// Whether the lane behind a junction takes one more vehicle.
+    /// True if the lane behind a junction has space for one more vehicle.
     fn has_exit_room(&self, index: usize, exit: Option<LaneId>) -> bool {
         let Some(exit) = exit.filter(|exit| !self.roads.graph.lane(*exit).in_junction) else { return true };
         let Some(&(s_m, last)) = self.occupants[exit.0 as usize].iter().find(|(_, other)| *other as usize != index)
@@ -117,7 +117,8 @@ impl Traffic<'_> {
         last.speed_mps > MOVING_ON_MPS || room_m > 2.0 * self.cars[index].half_length_m() + EXIT_ROOM_M
     }
 
-    /// Whoever stands or drives the same way in the strip that the vehicle will sweep: merging lanes, tails in bends.
+    /// The nearest vehicle that stands or drives the same way in the strip that the vehicle will sweep: merging lanes,
+    /// tails in bends.
     fn on_the_swept_way(&self, index: usize, near: &mut Vec<u32>) -> Option<Obstacle> {
         let car = &self.cars[index];
         if car.standing_s > PATIENCE_S {
@@ -158,7 +159,7 @@ impl Traffic<'_> {
         None
     }
 
-    /// The end of a road that leads nowhere.
+    /// The end of a road without successor.
     fn end_of_the_way(&self, index: usize) -> Option<Obstacle> {
         let car = &self.cars[index];
         let left_m = car.path.remaining_m(self.roads.graph);

@@ -1,8 +1,8 @@
 //! Vehicles that follow lanes, keep distance, slow down for bends, give way at junctions and change lanes.
 //!
-//! Traffic is simulated around one vehicle, the focus: whoever falls too far behind it leaves, and another vehicle comes
-//! in at the edge, out of sight. No two vehicles ever overlap: before all rules of the road, a vehicle moves only to
-//! where nobody is.
+//! Traffic is simulated around one vehicle, the focus: a vehicle too far from it leaves, and another one enters at the
+//! edge, out of sight. No two vehicles ever overlap: with priority over all traffic rules, a vehicle moves only into
+//! free space.
 
 mod car;
 mod driver;
@@ -32,21 +32,21 @@ use support::random::SplitMix64;
 pub(crate) const STEP_S: f64 = 0.05;
 /// Clearance that a moving vehicle keeps to everything, metres.
 const CLEARANCE_M: f64 = 0.1;
-/// The way ahead is decided at least this far, metres.
+/// The path ahead is decided at least this far, metres.
 const DECIDED_M: f64 = 90.0;
 
-/// How traffic is set up.
+/// Parameters of traffic.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct TrafficOptions {
     /// Vehicles per kilometre of lane around the focus.
     pub(crate) vehicles_per_km: f64,
     /// Vehicles farther than this from the focus leave, metres.
     pub(crate) radius_m: f64,
-    /// Whether the focus looks for roads where it has not been, instead of wandering.
+    /// True if the focus explores less visited roads, instead of wandering at random.
     pub(crate) focus_explores: bool,
 }
 
-/// The moving world.
+/// State of the traffic.
 #[derive(Debug)]
 pub(crate) struct Traffic<'t> {
     pub(super) roads: &'t Roads<'t>,
@@ -57,17 +57,17 @@ pub(crate) struct Traffic<'t> {
     /// The focus is the first.
     pub(crate) cars: Vec<Car>,
     right_of_way: RightOfWay,
-    /// Vehicles by lane, as place along it and index, in order.
+    /// Vehicles by lane, as position along it and index, in order.
     occupants: Vec<Vec<(f64, u32)>>,
     index: NeighbourIndex,
     random: SplitMix64,
     next_id: i64,
-    /// What a focus that explores knows of the roads.
+    /// State of the exploration, if the focus explores.
     explorer: Option<Explorer>,
 }
 
 impl<'t> Traffic<'t> {
-    /// Moves everybody by one [`STEP_S`].
+    /// Moves all vehicles by one [`STEP_S`].
     pub(crate) fn step(&mut self) {
         let mut near = Vec::new();
         self.list_occupants();
@@ -88,7 +88,7 @@ impl<'t> Traffic<'t> {
         self.exchange_far_cars();
     }
 
-    /// Moves one vehicle, unless somebody is in the way.
+    /// Moves one vehicle, unless another one blocks it.
     fn drive(&mut self, index: usize, speed_mps: f64, near: &mut Vec<u32>) {
         let car = &self.cars[index];
         let distance_m = speed_mps * STEP_S;
@@ -110,7 +110,7 @@ impl<'t> Traffic<'t> {
         self.index.relocate(index as u32, from, to);
     }
 
-    /// Whether nobody but `index` touches a footprint.
+    /// True if no vehicle except `index` touches a footprint.
     fn is_free(&self, index: usize, footprint: &Rectangle, near: &mut Vec<u32>) -> bool {
         let radius_m = footprint.radius_m() + 9.0;
         self.index.near(footprint.center_m, radius_m, near);
@@ -126,7 +126,7 @@ impl<'t> Traffic<'t> {
         self.occupants.iter_mut().for_each(Vec::clear);
         for (index, car) in self.cars.iter().enumerate().filter(|(_, car)| car.is_present) {
             self.occupants[car.path.lane().0 as usize].push((car.path.s_m(), index as u32));
-            // Those behind on the lane that it leaves must not run into it.
+            // Vehicles behind it on the lane that it leaves must not hit it.
             if let Some((lane, s_m)) = car.path.leaving(self.roads.graph) {
                 self.occupants[lane.0 as usize].push((s_m, index as u32));
             }
@@ -136,7 +136,7 @@ impl<'t> Traffic<'t> {
         }
     }
 
-    /// Appends lanes to ways that are decided not far enough.
+    /// Appends lanes to paths that are too short.
     fn decide_ways(&mut self) {
         for index in 0..self.cars.len() {
             while self.cars[index].is_present && self.cars[index].path.remaining_m(self.roads.graph) < DECIDED_M {

@@ -1,46 +1,48 @@
-//! The way of one vehicle: the lane it is on, the one it came from, those ahead.
+//! Path of one vehicle: its current lane, the previous one, and those ahead.
 
 use std::collections::VecDeque;
 
 use crate::generate::raycast::Placement;
 use crate::map::{Lane, LaneGraph, LaneId};
 
-/// A place on a chain of lanes.
+/// A position on a chain of lanes.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Path {
     /// Lanes in driving order, each a successor of the one before it.
     lanes: VecDeque<LaneId>,
-    /// Which of them the vehicle's middle is on.
+    /// Index of the lane under the vehicle's centre.
     current: usize,
-    /// How far along it, metres.
+    /// Position along that lane, metres.
     s_m: f64,
     /// The change of lanes under way.
     change: Option<Change>,
 }
 
-/// A lane of the way, and its neighbour which the vehicle leaves for it. Equal shares of their lengths lie side by side.
+/// A lane of the path, and its neighbour which the vehicle leaves for it. Equal shares of their lengths lie side by
+/// side.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Beside {
     pub(crate) lane: LaneId,
     pub(crate) left: LaneId,
 }
 
-/// A change of lanes: a curve from one to the other, laid out along the way and not in time, so that a vehicle that
+/// A change of lanes: a curve from one to the other, parametrised by distance and not by time, so that a vehicle that
 /// has to stop stops across the lanes and does not slide sideways.
 #[derive(Debug, Clone, PartialEq)]
 struct Change {
     beside: Vec<Beside>,
-    /// How far the vehicle's middle is past the beginning of the curve, metres.
+    /// Distance of the vehicle's centre past the beginning of the curve, metres.
     done_m: f64,
     length_m: f64,
     wheelbase_m: f64,
 }
 
 impl Change {
-    /// How much of the way from the old lane to the new one is done `offset_m` ahead of the vehicle's middle, 0 to 1.
+    /// Share of the lateral shift from the old lane to the new one that is done `offset_m` ahead of the vehicle's
+    /// centre, 0 to 1.
     fn share(&self, offset_m: f64) -> f64 {
         let t = ((self.done_m + offset_m) / self.length_m).clamp(0.0, 1.0);
-        // Place, heading and curvature begin and end with those of the lanes.
+        // Position, heading and curvature begin and end with those of the lanes.
         t * t * t * (10.0 + t * (6.0 * t - 15.0))
     }
 
@@ -49,7 +51,7 @@ impl Change {
     }
 }
 
-/// A changing vehicle is counted on its old lane too until so much of the change is done.
+/// A changing vehicle also counts on its old lane until this share of the change is done.
 const LEFT_SHARE: f64 = 0.7;
 
 impl Path {
@@ -58,12 +60,12 @@ impl Path {
         Self { lanes: VecDeque::from([lane]), current: 0, s_m, change: None }
     }
 
-    /// The lane under the vehicle's middle.
+    /// The lane under the vehicle's centre.
     pub(crate) fn lane(&self) -> LaneId {
         self.lanes[self.current]
     }
 
-    /// How far along that lane, metres.
+    /// Position along that lane, metres.
     pub(crate) fn s_m(&self) -> f64 {
         self.s_m
     }
@@ -78,8 +80,8 @@ impl Path {
         self.lanes.push_back(lane);
     }
 
-    /// Leaves the present lane for its neighbour over `length_m` metres: `beside` are the lanes of the new way from
-    /// there on, `s_m` is the vehicle's place on the first. The front axle is where the curve begins.
+    /// Leaves the present lane for its neighbour over `length_m` metres: `beside` are the lanes of the new path from
+    /// there on, `s_m` is the vehicle's position on the first. The curve begins at the front axle.
     pub(crate) fn change(&mut self, beside: Vec<Beside>, s_m: f64, length_m: f64, wheelbase_m: f64) {
         self.lanes.truncate(self.current);
         self.lanes.extend(beside.iter().map(|pair| pair.lane));
@@ -87,24 +89,25 @@ impl Path {
         self.change = Some(Change { beside, done_m: -0.5 * wheelbase_m, length_m, wheelbase_m });
     }
 
-    /// Whether the vehicle is between two lanes.
+    /// True if the vehicle is between two lanes.
     pub(crate) fn is_changing(&self) -> bool {
         self.change.is_some()
     }
 
-    /// The lane that the vehicle is leaving and its place there, metres, while it takes up room there.
+    /// The lane that the vehicle is leaving and its position there, metres, while it occupies space there.
     pub(crate) fn leaving(&self, graph: &LaneGraph) -> Option<(LaneId, f64)> {
         let change = self.change.as_ref().filter(|change| change.share(0.0) < LEFT_SHARE)?;
         let left = change.left_beside(self.lane())?;
         Some((left, self.s_m / graph.lane(self.lane()).length_m * graph.lane(left).length_m))
     }
 
-    /// How far the decided way goes on, metres.
+    /// Length of the decided path ahead, metres.
     pub(crate) fn remaining_m(&self, graph: &LaneGraph) -> f64 {
         self.ahead(graph).map(|(lane, start_m)| start_m + graph.lane(lane).length_m).last().unwrap_or(0.0)
     }
 
-    /// The lane under the vehicle and those ahead, each with how far ahead it begins (negative for the first), metres.
+    /// The lane under the vehicle and those ahead, each with the distance to its start (negative for the first),
+    /// metres.
     pub(crate) fn ahead<'a>(&'a self, graph: &'a LaneGraph) -> impl Iterator<Item = (LaneId, f64)> + 'a {
         let mut start_m = -self.s_m;
         self.lanes.iter().skip(self.current).map(move |&lane| {
@@ -114,7 +117,7 @@ impl Path {
         })
     }
 
-    /// Drives on. Lanes farther back than the previous one are forgotten, unless a long vehicle still stands on them.
+    /// Drives on. Lanes farther back than the previous one are removed, unless a long vehicle still stands on them.
     pub(crate) fn advance(&mut self, graph: &LaneGraph, distance_m: f64, keep_behind_m: f64) {
         self.s_m += distance_m;
         if let Some(change) = &mut self.change {
@@ -134,7 +137,7 @@ impl Path {
         }
     }
 
-    /// Lanes which the stretch from `behind_m` behind to the vehicle's middle touches, the current one first.
+    /// Lanes touched by the stretch from `behind_m` behind to the vehicle's centre, the current one first.
     pub(crate) fn lanes_under(&self, graph: &LaneGraph, behind_m: f64) -> impl Iterator<Item = LaneId> + '_ {
         let mut left_m = behind_m - self.s_m;
         let mut lanes = vec![self.lane()];
@@ -148,19 +151,19 @@ impl Path {
         lanes.into_iter()
     }
 
-    /// The point `offset_m` ahead of (or behind) the vehicle's middle, straight on where the way is not known.
+    /// The point `offset_m` ahead of (or behind) the vehicle's centre, extrapolated straight beyond the known path.
     pub(crate) fn point_m(&self, graph: &LaneGraph, offset_m: f64) -> [f64; 3] {
         self.mixed(graph, offset_m, point_on, |from, to, share| {
             std::array::from_fn(|axis| from[axis] + share * (to[axis] - from[axis]))
         })
     }
 
-    /// Slope across the way there, radians; positive where the left side is higher.
+    /// Slope across the path there, radians; positive where the left side is higher.
     fn bank_rad(&self, graph: &LaneGraph, offset_m: f64) -> f64 {
         self.mixed(graph, offset_m, Lane::bank_rad, |from, to, share| from + share * (to - from))
     }
 
-    /// What a lane has `offset_m` ahead of the vehicle's middle; during a change, mixed from both lanes.
+    /// Value of a lane property `offset_m` ahead of the vehicle's centre; during a change, mixed from both lanes.
     fn mixed<T>(
         &self,
         graph: &LaneGraph,
@@ -191,7 +194,7 @@ impl Path {
         }
     }
 
-    /// Where a vehicle of this wheelbase stands after `drive_m` more metres, both axles on the way, `aside_m` to the
+    /// Placement of a vehicle of this wheelbase after `drive_m` more metres, both axles on the path, `aside_m` to the
     /// left of it.
     pub(crate) fn placement(&self, graph: &LaneGraph, drive_m: f64, wheelbase_m: f64, aside_m: f64) -> Placement {
         let front = self.point_m(graph, drive_m + 0.5 * wheelbase_m);
@@ -208,7 +211,7 @@ impl Path {
     }
 }
 
-/// A place on a lane, straight on before its start and behind its end.
+/// A position on a lane, straight on before its start and behind its end.
 fn point_on(lane: &Lane, s_m: f64) -> [f64; 3] {
     let (point, heading) = lane.at(s_m);
     let beyond_m = s_m - s_m.clamp(0.0, lane.length_m);

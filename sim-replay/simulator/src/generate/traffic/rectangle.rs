@@ -1,4 +1,4 @@
-//! Footprints of vehicles seen from above, and which of them touch.
+//! Footprints of vehicles seen from above, and their overlap.
 
 use crate::generate::raycast::Placement;
 
@@ -10,7 +10,7 @@ pub(crate) struct Rectangle {
     pub(crate) axis: [f64; 2],
     /// Half length and half width.
     pub(crate) half_m: [f64; 2],
-    /// Height of the ground below: what passes on another level does not touch.
+    /// Height of the ground below: footprints on different levels do not touch.
     pub(crate) z_m: f64,
 }
 
@@ -36,7 +36,7 @@ impl Rectangle {
         self.half_m[0].hypot(self.half_m[1])
     }
 
-    /// Whether both lie on one level and share a point (separating axes).
+    /// True if both lie on one level and share a point (separating axes).
     pub(crate) fn overlaps(&self, other: &Self) -> bool {
         let offset = [other.center_m[0] - self.center_m[0], other.center_m[1] - self.center_m[1]];
         if (self.z_m - other.z_m).abs() > LEVEL_M || offset[0].hypot(offset[1]) > self.radius_m() + other.radius_m() {
@@ -68,7 +68,7 @@ fn dot(a: [f64; 2], b: [f64; 2]) -> f64 {
 /// Edge of a cell of the index, metres; no vehicle's circle is larger.
 const CELL_M: f64 = 16.0;
 
-/// Who is near: indices by cell of a coarse grid.
+/// Neighbour index: indices of vehicles by cell of a coarse grid.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct NeighbourIndex {
     cells: std::collections::HashMap<(i32, i32), Vec<u32>>,
@@ -83,7 +83,7 @@ impl NeighbourIndex {
         self.cells.entry(Self::cell(point)).or_default().push(index);
     }
 
-    /// Takes an entry from one place to another.
+    /// Moves an entry from one position to another.
     pub(crate) fn relocate(&mut self, index: u32, from: [f64; 2], to: [f64; 2]) {
         if Self::cell(from) == Self::cell(to) {
             return;
@@ -94,14 +94,14 @@ impl NeighbourIndex {
         self.insert(index, to);
     }
 
-    /// Takes an entry out.
+    /// Removes an entry.
     pub(crate) fn remove(&mut self, index: u32, point: [f64; 2]) {
         if let Some(cell) = self.cells.get_mut(&Self::cell(point)) {
             cell.retain(|&entry| entry != index);
         }
     }
 
-    /// Everyone in the cells within `radius_m` of `point`, in an order that depends on the contents alone.
+    /// All entries in the cells within `radius_m` of `point`, in an order that depends on the contents alone.
     pub(crate) fn near(&self, point: [f64; 2], radius_m: f64, found: &mut Vec<u32>) {
         found.clear();
         let (low, high) = (

@@ -1,26 +1,26 @@
-//! What traffic asks of a road network again and again, worked out once.
+//! Precomputed properties of a road network for traffic.
 
 use super::driver::bend_speeds_mps;
 use crate::map::{Lane, LaneGraph, LaneId};
 
-/// Distance between places where a vehicle may appear, metres.
+/// Distance between places where a vehicle may be placed, metres.
 const SPAWN_STEP_M: f64 = 4.0;
-/// Vehicles do not appear closer than this to the ends of a lane, metres.
+/// Least distance of such places from the ends of a lane, metres.
 const SPAWN_EDGE_M: f64 = 3.0;
 
-/// A lane graph and what follows from it.
+/// A lane graph with derived properties.
 #[derive(Debug)]
 pub(crate) struct Roads<'t> {
     pub(crate) graph: &'t LaneGraph,
-    /// Fastest speed at each point of each centre line, metres per second.
+    /// Highest speed at each point of each centre line, metres per second.
     bend_speeds: Vec<Vec<f32>>,
-    /// Whether one can drive on from a lane for ever.
+    /// True if a path from the lane never ends.
     endless: Vec<bool>,
-    /// Places outside junctions where a vehicle may appear.
+    /// Places outside junctions where a vehicle may be placed.
     pub(crate) spawns: Vec<Spawn>,
 }
 
-/// A place where a vehicle may appear.
+/// A place where a vehicle may be placed.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Spawn {
     pub(crate) lane: LaneId,
@@ -37,19 +37,19 @@ impl<'t> Roads<'t> {
         Self { graph, bend_speeds: graph.lanes.iter().map(bend_speeds_mps).collect(), endless, spawns }
     }
 
-    /// Fastest speed at a place on a lane, metres per second.
+    /// Highest speed at a position on a lane, metres per second.
     pub(crate) fn speed_mps(&self, lane: LaneId, s_m: f64) -> f64 {
         let speeds = &self.bend_speeds[lane.0 as usize];
         let step = s_m / self.graph.lane(lane).length_m * (speeds.len() - 1) as f64;
         f64::from(speeds[(step.max(0.0) as usize).min(speeds.len() - 1)])
     }
 
-    /// Whether one can drive on from a lane for ever.
+    /// True if a path from the lane never ends.
     pub(crate) fn is_endless(&self, lane: LaneId) -> bool {
         self.endless[lane.0 as usize]
     }
 
-    /// The lanes one may go on to: those that do not end somewhere, where there are such.
+    /// The successors of a lane: those that never end, if there are any.
     pub(crate) fn onward(&self, lane: LaneId) -> Vec<LaneId> {
         let successors = &self.graph.lane(lane).successors;
         let endless: Vec<LaneId> = successors.iter().copied().filter(|next| self.endless[next.0 as usize]).collect();
@@ -66,7 +66,7 @@ fn spawns_of(lane: &Lane) -> impl Iterator<Item = Spawn> + '_ {
     })
 }
 
-/// Takes away lanes without successors until none is left.
+/// Removes lanes without successors until none is left.
 fn endless_lanes(graph: &LaneGraph) -> Vec<bool> {
     let mut onward: Vec<usize> = graph.lanes.iter().map(|lane| lane.successors.len()).collect();
     let mut before: Vec<Vec<LaneId>> = vec![Vec::new(); graph.lanes.len()];

@@ -1,4 +1,4 @@
-//! How vehicles come into a scene and leave it.
+//! Spawning and removal of vehicles.
 
 use super::car::Car;
 use super::driver::Driver;
@@ -13,15 +13,15 @@ use crate::generate::raycast::Sweep;
 use crate::generate::vehicle::Vehicle;
 use support::random::SplitMix64;
 
-/// New vehicles come in at most this far inside the edge, metres.
+/// New vehicles are placed at most this far inside the edge, metres.
 const EDGE_M: f64 = 35.0;
 /// Free room before and behind a new vehicle, metres.
 const SPAWN_ROOM_M: f64 = 4.0;
-/// Vehicles that stand longer than this with nobody before them are stuck in a knot, and leave, seconds.
+/// Vehicles that stand longer than this without a vehicle before them are gridlocked, and leave, seconds.
 const STUCK_S: f64 = 45.0;
-/// While the focus is stuck, somebody near it leaves this often, seconds.
+/// Interval at which vehicles near a blocked focus leave, seconds.
 const NEXT_LEAVES_S: f64 = 5.0;
-/// Whoever stands farther behind its leader than this has nobody before it, metres.
+/// A vehicle that stands farther behind its leader than this counts as having none, metres.
 const QUEUE_GAP_M: f64 = 8.0;
 /// Tries to place one vehicle in one step.
 const TRIES: usize = 4;
@@ -99,7 +99,7 @@ impl<'t> Traffic<'t> {
         let driver = Driver::random(&mut self.random);
         let path = Path::new(spawn.lane, spawn.s_m);
         let aside_m = self.random.between(-0.2, 0.2);
-        let lane_mood = LaneChangeState::random(&mut self.random);
+        let lane_change = LaneChangeState::random(&mut self.random);
         let placement = path.placement(self.roads.graph, 0.0, 0.6 * vehicle.size_m[0], aside_m);
         let speed_mps = 0.6 * driver.pace * self.roads.speed_mps(spawn.lane, spawn.s_m);
         self.index.insert(self.cars.len() as u32, placement.position_m.xy().into());
@@ -111,7 +111,7 @@ impl<'t> Traffic<'t> {
             aside_m,
             speed_mps,
             leader: None,
-            lane_mood,
+            lane_change,
             motion: Sweep::still(placement),
             is_present: true,
             standing_s: 0.0,
@@ -120,10 +120,11 @@ impl<'t> Traffic<'t> {
         self.next_id += 1;
     }
 
-    /// Takes out who is too far from the focus, at the end of a road or stuck, and lets others in at the edge.
+    /// Removes vehicles that are too far from the focus, at the end of a road or stuck, and places new ones at the
+    /// edge.
     ///
-    /// Full roundabouts and long vehicles that meet in a junction tie knots that nobody can undo by waiting; as in other
-    /// traffic simulations, the one who has stood longest at the head of a queue then leaves the scene.
+    /// Full roundabouts and long vehicles in a junction cause gridlocks that waiting does not resolve; as in other
+    /// traffic simulations, the vehicle that has stood longest at the head of a queue then leaves the scene.
     pub(super) fn exchange_far_cars(&mut self) {
         let center_m = self.cars[0].point_m();
         let stuck = self.longest_stuck();
@@ -155,8 +156,8 @@ impl<'t> Traffic<'t> {
         }
     }
 
-    /// The vehicle that has stood longest at the head of a queue, when that is too long; the focus stays, and those who
-    /// stand around it leave one by one.
+    /// The vehicle that has stood longest at the head of a queue, if that is too long; the focus stays, and the
+    /// vehicles around it leave one by one.
     fn longest_stuck(&self) -> Option<usize> {
         let over_s = self.cars[0].standing_s - STUCK_S;
         if over_s > 0.0 && over_s % NEXT_LEAVES_S < STEP_S {

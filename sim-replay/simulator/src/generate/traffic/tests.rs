@@ -1,4 +1,4 @@
-//! Traffic in whole towns.
+//! Traffic on whole maps.
 
 use super::*;
 use crate::generate::vehicle::Vehicle;
@@ -21,7 +21,7 @@ fn overlaps(traffic: &Traffic<'_>) -> Vec<(i64, i64)> {
 }
 
 #[test]
-fn nobody_overlaps_and_most_get_on() {
+fn no_vehicles_overlap_and_most_move() {
     for source in [TownSource::Town1, TownSource::Town4] {
         let town = build(&source, 0).unwrap();
         let roads = Roads::new(&town.lanes);
@@ -43,14 +43,14 @@ fn nobody_overlaps_and_most_get_on() {
                 }
             }
             assert!(moving * 2 > all, "{} seed {seed}: {moving} of {all} vehicle steps are moving", town.name);
-            // The first town has one lane each way.
+            // The first map has one lane each way.
             assert_eq!(changing > 0, source == TownSource::Town4, "{} seed {seed}: {changing}", town.name);
         }
     }
 }
 
 #[test]
-fn vehicles_follow_with_a_gap_and_stop_for_who_stands() {
+fn vehicles_keep_a_gap_and_stop_behind_standing_ones() {
     let line = (0..400).map(|x| [f64::from(x), 0.0, 0.0]).collect();
     let graph = LaneGraph::new(vec![Lane::new(LaneId(0), line, 3.5, 14.0)]);
     let roads = Roads::new(&graph);
@@ -118,11 +118,11 @@ fn a_driver_changes_lanes_smoothly_to_get_past_somebody_slow() {
 }
 
 #[test]
-fn nobody_changes_into_somebody() {
+fn no_lane_change_causes_a_collision() {
     let graph = two_lanes(900);
     let roads = Roads::new(&graph);
     let mut traffic = Traffic::new(&roads, &[], options(0.0), roads.spawns[0], 3);
-    // Two abreast, equally slow: there is no way past.
+    // Two abreast, equally slow: overtaking is impossible.
     add_slow(&mut traffic, 0, 60.0, 0.3);
     add_slow(&mut traffic, 1, 56.0, 0.3);
     for _ in 0..1200 {

@@ -1,4 +1,4 @@
-//! Puts roads and junctions together.
+//! Road network builder: adds roads and junctions and links them.
 
 use super::super::clothoid;
 use super::super::curve::{Curve, CurveShape, Pose2};
@@ -27,7 +27,7 @@ pub(super) struct LaneEnd {
     pub lane: i32,
 }
 
-/// A road network in the making.
+/// A road network under construction.
 #[derive(Default)]
 pub(super) struct Builder {
     pub network: RoadNetwork,
@@ -147,7 +147,7 @@ impl Builder {
         self.driving_lanes(end, end.contact == Contact::Start)
     }
 
-    /// Where the reference line ends, looking away from the road.
+    /// Pose at the end of the reference line, facing away from the road.
     pub(super) fn outward_pose(&self, end: RoadEnd) -> Pose2 {
         let road = &self.network.roads[end.road];
         match end.contact {

@@ -7,7 +7,7 @@ use rand_chacha::ChaCha8Rng;
 use super::super::curve::Pose2;
 use super::streets::{Node, StreetGraph};
 
-/// What a grid of streets is made from.
+/// Parameters of a grid of streets.
 pub(super) struct GridPlan {
     /// x of the columns, metres, rising.
     pub columns_m: Vec<f64>,
@@ -29,8 +29,8 @@ pub(super) fn spread(low: f64, high: f64, count: usize, share: f64, rng: &mut Ch
     (0..count).map(value).collect()
 }
 
-/// A grid whose column at `x` reaches over `y_range(x)`. Every street can be left at both ends: no place has just one
-/// street, and all hang together. With a `port`, the place nearest to it has a street to it.
+/// A grid whose column at `x` reaches over `y_range(x)`. Every street can be left at both ends: every node has at least
+/// two streets, and the grid is connected. With a `port`, the node nearest to it has a street to it.
 pub(super) fn grid(
     plan: &GridPlan,
     y_range: impl Fn(f64) -> [f64; 2],
@@ -44,7 +44,7 @@ pub(super) fn grid(
         if let Some(port) = port {
             attach(&mut graph, port);
         }
-        // Without any jitter the grid is as good as its plan: take it as it is.
+        // Without any jitter the grid matches its plan: accept it as it is.
         if graph.has_room() || calm < 0.05 {
             return graph;
         }
@@ -58,7 +58,7 @@ fn full_grid(plan: &GridPlan, y_range: impl Fn(f64) -> [f64; 2], calm: f64, rng:
     let jitter = (plan.jitter_m * calm).max(1e-3);
     let mut graph = StreetGraph::default();
     let ranges: Vec<[f64; 2]> = plan.columns_m.iter().map(|&x| y_range(x)).collect();
-    // The calmer, the more all columns keep to what they have in common: then the rows are at right angles to them.
+    // The smaller `calm`, the closer all columns are to their common shape: then the rows are at right angles to them.
     let common =
         ranges.iter().fold([f64::NEG_INFINITY, f64::INFINITY], |[a, b], [low, high]| [a.max(*low), b.min(*high)]);
     for (&x, own) in plan.columns_m.iter().zip(&ranges) {
@@ -111,7 +111,7 @@ fn leave_out(graph: &mut StreetGraph, share: f64, rng: &mut ChaCha8Rng) {
     }
 }
 
-/// Whether everything stays connected with any one street closed: then no street is a dead end.
+/// True if everything stays connected with any one street closed: then no street is a dead end.
 fn two_ways_everywhere(graph: &StreetGraph) -> bool {
     (0..graph.edges.len()).all(|closed| {
         let mut reached = vec![false; graph.nodes.len()];

@@ -14,7 +14,7 @@ use super::road::RoadNetwork;
 pub(super) use town1::lay_out as town1;
 pub(super) use town4::lay_out as town4;
 
-/// A road network, and what belongs to its shape but to no road.
+/// A road network with the parts of its shape that belong to no road.
 pub(super) struct Layout {
     /// Roads and junctions.
     pub network: RoadNetwork,

@@ -66,7 +66,7 @@ impl Motorway {
         [roads[0], roads[roads.len() - 1]]
     }
 
-    /// Lets `ramp` leave between two carriageways: all lanes go on, the outermost one also into the ramp.
+    /// Lets `ramp` leave between two carriageways: all lanes continue, the outermost one also into the ramp.
     pub(super) fn diverge(&self, builder: &mut Builder, before: usize, after: usize, ramp: usize) {
         let junction = builder.junction();
         self.go_on(builder, junction, before, after);

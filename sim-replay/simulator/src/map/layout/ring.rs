@@ -27,7 +27,7 @@ pub(super) struct Ring {
 struct Bump {
     middle_m: f64,
     height_m: f64,
-    /// Half of the level stretch, and where the rise begins.
+    /// Half of the level stretch: the distance at which the rise begins.
     plateau_m: f64,
     reach_m: f64,
 }

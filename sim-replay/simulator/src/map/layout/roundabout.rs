@@ -9,14 +9,14 @@ use super::builder::{Builder, CrossProfile, LaneEnd, RoadEnd, arc};
 
 /// Width of the ring's lane, metres.
 const LANE_M: f64 = 5.0;
-/// Distance from the ring's middle line to where arms end, metres.
+/// Distance from the ring's centre line to the ends of the arms, metres.
 const PORT_M: f64 = 15.0;
-/// Distance along the ring from an arm to where it joins, metres.
+/// Distance along the ring from an arm to the point where it joins, metres.
 const JOIN_M: f64 = 12.5;
 /// Speed on the ring, metres per second.
 const LIMIT_MPS: f64 = 8.0;
 
-/// Where a roundabout is.
+/// Position and size of a roundabout.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Roundabout {
     pub center_m: [f64; 2],
@@ -25,7 +25,7 @@ pub(super) struct Roundabout {
 }
 
 impl Roundabout {
-    /// Where the arm at an angle ends, looking away from the roundabout.
+    /// End of the arm at an angle, facing away from the roundabout.
     pub(super) fn port(&self, angle_rad: f64) -> Pose2 {
         Pose2::new(self.center_m[0], self.center_m[1], angle_rad).moved(self.radius_m + PORT_M, 0.0, 0.0)
     }

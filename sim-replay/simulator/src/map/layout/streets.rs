@@ -1,4 +1,4 @@
-//! Streets of a town: from a graph of places and edges to roads, corners and junctions.
+//! Streets: makes roads, corners and junctions from a graph of nodes and edges.
 
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
@@ -26,8 +26,8 @@ const LEAST_STREET_M: f64 = 12.0;
 pub(super) struct Node {
     pub x: f64,
     pub y: f64,
-    /// Set where the one street of this node ends at something already laid out: the pose there, looking outwards, into
-    /// the street.
+    /// Set where the one street of this node ends at a road that is already laid out: the pose there, facing outwards,
+    /// into the street.
     pub port: Option<Pose2>,
 }
 
@@ -60,7 +60,7 @@ impl StreetGraph {
         (self.nodes[b].x - self.nodes[a].x).hypot(self.nodes[b].y - self.nodes[a].y)
     }
 
-    /// Whether every street is long enough for the junctions and corners at its ends, even a broad one.
+    /// True if every street is long enough for the junctions and corners at its ends, even a broad one.
     pub(super) fn has_room(&self) -> bool {
         let radius = |node: usize| {
             if self.nodes[node].port.is_some() {
@@ -216,7 +216,7 @@ fn poses(graph: &StreetGraph, chain: &Chain, radii: &[f64]) -> Vec<Pose2> {
     poses
 }
 
-/// Where a street begins at its first (0) or last (1) node, looking into the street.
+/// Pose at which a street begins at its first (0) or last (1) node, facing into the street.
 fn end_pose(graph: &StreetGraph, chain: &Chain, radii: &[f64], which: usize) -> Pose2 {
     let last = chain.nodes.len() - 1;
     let (node, next) =

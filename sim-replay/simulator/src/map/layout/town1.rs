@@ -11,7 +11,7 @@ use super::streets;
 /// Speed limit: 25 mph, as in CARLA's Town01.
 const LIMIT_MPS: f64 = 11.176;
 
-/// Lays out the town of a seed.
+/// Lays out the map of a seed.
 pub(crate) fn lay_out(seed: u64) -> Layout {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let (width, height) = (rng.random_range(385.0..415.0), rng.random_range(325.0..355.0));
@@ -19,7 +19,7 @@ pub(crate) fn lay_out(seed: u64) -> Layout {
     // Streets that are not at right angles: the rows' ends lie at different heights.
     let (shear, taper) = (rng.random_range(-0.1..0.1), rng.random_range(-0.08..0.08));
     let columns_m = spread(0.0, width, columns, 0.22, &mut rng);
-    // A denser grid loses more streets, so that towns of all grids are about as long.
+    // A denser grid loses more streets, so that the total length is about the same for all grids.
     let left_out = if columns + rows == 9 { 0.04 } else { 0.14 };
     let plan = GridPlan { columns_m, rows, left_out, jitter_m: 5.0 };
     let y_range = |x: f64| {

@@ -26,7 +26,7 @@ const STREETS_M: f64 = 58.0;
 const TOWN_LIMIT_MPS: f64 = 13.41;
 const LINK_LIMIT_MPS: f64 = 15.65;
 
-/// Lays out the town of a seed.
+/// Lays out the map of a seed.
 pub(crate) fn lay_out(seed: u64) -> Layout {
     let mut rng = ChaCha8Rng::seed_from_u64(seed ^ 0x7465_776e_3474_6f77);
     let mut builder = Builder::default();

@@ -1,11 +1,11 @@
-//! `<objects>` and `<signals>`: what stands beside a road, and its bridges and tunnels.
+//! `<objects>` and `<signals>`: objects beside a road, and its bridges and tunnels.
 
 use super::super::finding::FindingLog;
 use super::super::road::{RoadObject, RoadSignal, RoadStructure};
 use super::OpenDriveError;
 use super::element::{Element, MAX_LENGTH_M, children};
 
-/// Everything named `name` in the list `list` of a road; what cannot be read is left out.
+/// Every element named `name` in the list `list` of a road; elements that cannot be read are left out.
 fn read_all<T>(
     road: Element,
     list: &'static str,
@@ -66,8 +66,8 @@ pub(super) fn read_structures(road: Element, road_length_m: f64, log: &mut Findi
     structures
 }
 
-/// Cuts tunnels so that none reaches into the next or beyond its road, and leaves out those of which nothing is left:
-/// together they are at most as long as the road, however many a map has for its lanes.
+/// Cuts tunnels so that none reaches into the next or beyond its road, and leaves out empty ones: together they are at
+/// most as long as the road, however many a map has for its lanes.
 fn part_tunnels(structures: &mut Vec<RoadStructure>, road_length_m: f64) {
     structures.sort_by(|a, b| a.tunnel.cmp(&b.tunnel).then(a.s_m.total_cmp(&b.s_m)));
     let mut covered_m = 0.0;

@@ -1,4 +1,4 @@
-//! `<border>`: lanes given by where they end instead of how wide they are.
+//! `<border>`: lanes given by the position of their outer edge instead of their width.
 //!
 //! A border is a `t` coordinate, whatever lies inside it: a lane's width is the distance between its border and the
 //! inner border, which is the border or the width of the lane inside it, or the lane offset. Differences of cubics
@@ -13,7 +13,7 @@ use super::element::Element;
 use super::lanes::Stretch;
 use super::profile::read_profile;
 
-/// Looks along a section for widths below zero.
+/// Samples along a section at which widths below zero are searched.
 const LOOKS: u32 = 20;
 /// A border this far inside the inner border is rounding, metres.
 const ROUNDING_M: f64 = 0.01;

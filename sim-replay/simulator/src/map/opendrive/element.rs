@@ -1,13 +1,13 @@
-//! Typed access to XML elements, with errors that name the place, and findings where a value is treated as absent.
+//! Typed access to XML elements, with errors that give the position, and findings where a value is treated as absent.
 
 use roxmltree::Node;
 
 use super::super::finding::FindingLog;
 
-/// Why a map cannot be used.
+/// Reasons why a map cannot be used.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum OpenDriveError {
-    /// The file is larger than maps are.
+    /// The file is larger than the limit.
     #[error("the file has {bytes} bytes, more than the limit of {limit}")]
     TooLarge {
         /// Size of the file.
@@ -25,7 +25,7 @@ pub enum OpenDriveError {
         line: u32,
         /// Name of the element.
         element: String,
-        /// What is wrong.
+        /// The fault.
         problem: String,
     },
     /// An attribute is missing.
@@ -38,7 +38,7 @@ pub enum OpenDriveError {
         /// Name of the attribute.
         attribute: &'static str,
     },
-    /// An attribute's value is not what it has to be.
+    /// An attribute has an invalid value.
     #[error("line {line}: <{element}> has {attribute}=\"{value}\"; expected {expected}")]
     Value {
         /// Line in the file.
@@ -47,15 +47,15 @@ pub enum OpenDriveError {
         element: String,
         /// Name of the attribute.
         attribute: &'static str,
-        /// What the file says.
+        /// Value in the file.
         value: String,
-        /// What it should say.
+        /// Valid values.
         expected: String,
     },
 }
 
 impl OpenDriveError {
-    /// Writes the error down as a finding: what it is about was handled by `action`.
+    /// Records the error as a finding: the affected part was handled by `action`.
     pub(super) fn note(&self, log: &mut FindingLog, action: &str) {
         match self {
             Self::TooLarge { .. } | Self::Xml(_) => log.add(1, "OpenDRIVE", &self.to_string(), action),
@@ -70,8 +70,8 @@ impl OpenDriveError {
     }
 }
 
-/// Line numbers of places in a text, with one count for each block: the document itself would count from its beginning
-/// for each place, and a list of all lines could be larger than the text.
+/// Line numbers of positions in a text, with one count for each block: the XML document itself would count from its
+/// start for each position, and a list of all lines could be larger than the text.
 pub(super) struct LineIndex<'input> {
     text: &'input [u8],
     /// Line breaks before each block.
@@ -133,7 +133,7 @@ impl<'a, 'input> Element<'a, 'input> {
         self.node.children().filter(Node::is_element).map(move |node| Self { node, lines })
     }
 
-    /// The largest size of a number among the descendants with a name; 0 where there is none.
+    /// The largest magnitude of a number among the descendants with a name; 0 where there is none.
     pub(super) fn largest(&self, name: &'static str, attribute: &'static str) -> f64 {
         let nodes = self.node.descendants().filter(|node| node.has_tag_name(name));
         let values = nodes.filter_map(|node| node.attribute(attribute)?.trim().parse::<f64>().ok());
@@ -184,7 +184,7 @@ impl<'a, 'input> Element<'a, 'input> {
     pub(super) fn lane_id(&self, attribute: &'static str) -> Result<i32, OpenDriveError> {
         let text = self.text(attribute)?;
         let value: i32 = text.trim().parse().map_err(|_| self.error_value(attribute, text, "a lane id"))?;
-        // The lowest number of all has no positive one.
+        // The absolute value of the lowest `i32` does not fit into an `i32`.
         if value.unsigned_abs() <= MAX_LANES.unsigned_abs() {
             Ok(value)
         } else {
@@ -201,12 +201,12 @@ impl<'a, 'input> Element<'a, 'input> {
         Ok(coefficients)
     }
 
-    /// Writes a finding about this element down.
+    /// Records a finding about this element.
     pub(super) fn note(&self, log: &mut FindingLog, found: &str, action: &str) {
         log.add(self.line(), self.name(), found, action);
     }
 
-    /// Writes the value of an attribute down as a finding.
+    /// Records the value of an attribute as a finding.
     pub(super) fn note_value(&self, log: &mut FindingLog, attribute: &'static str, action: &str) {
         let value = self.optional_text(attribute).unwrap_or_default();
         self.note(log, &format!("{attribute}=\"{value}\""), action);

@@ -1,4 +1,4 @@
-//! From the bytes of a map to its text: byte order marks, declared encodings, and bytes that are neither.
+//! Text decoding: from the bytes of a map to its text, by byte order mark, declared encoding, or windows-1252.
 
 use std::borrow::Cow;
 
@@ -6,11 +6,11 @@ use encoding_rs::{Encoding, UTF_8, UTF_16BE, UTF_16LE, WINDOWS_1252};
 
 use super::super::finding::FindingLog;
 
-/// The declaration stands within this many bytes.
+/// The declaration lies within this many bytes.
 const DECLARATION_BYTES: usize = 200;
 
-/// The text of a file, without byte order mark. A mark wins over the declaration; where bytes do not fit the encoding,
-/// the text is read as Western European (windows-1252), in which any byte means something.
+/// The text of a file, without byte order mark. A mark takes precedence over the declaration; where bytes do not fit
+/// the encoding, the text is read as Western European (windows-1252), in which every byte is a character.
 pub(super) fn decode<'a>(bytes: &'a [u8], log: &mut FindingLog) -> Cow<'a, str> {
     let (encoding, mark) = match Encoding::for_bom(bytes) {
         Some(found) => found,
@@ -81,7 +81,7 @@ mod tests {
     }
 
     #[test]
-    fn what_does_not_fit_is_read_all_the_same_and_named() {
+    fn invalid_bytes_are_read_and_reported() {
         let (text, found) = decoded(b"<?xml version=\"1.0\" encoding=\"UTF-8\"?><a b=\"Stra\xdfe\"/>");
         assert!(text.contains("Straße"), "{text}");
         assert_eq!(found, ["line 1: <OpenDRIVE> holds bytes that are not UTF-8; read as windows-1252"]);

@@ -1,4 +1,4 @@
-//! `<junction>`: the ways through it.
+//! `<junction>`: connections of roads through a junction.
 
 use super::super::finding::FindingLog;
 use super::super::road::{Connection, Junction};
@@ -13,7 +13,7 @@ pub(super) fn read(element: Element, ids: &Ids, log: &mut FindingLog) -> Junctio
     match kind {
         "default" | "direct" | "" => {}
         "virtual" => element.note_value(log, "type", "built only where its roads begin or end at other roads' ends"),
-        "crossing" => element.note_value(log, "type", "left out: nobody crosses the road there"),
+        "crossing" => element.note_value(log, "type", "left out: pedestrian crossings are not simulated"),
         _ => element.note_value(log, "type", "treated as a common junction"),
     }
     let mut connections = Vec::new();

@@ -45,7 +45,7 @@ pub(super) fn read_sections(
     Ok(sections)
 }
 
-/// Where a section lies.
+/// Position of a section along its road.
 pub(super) struct Stretch<'a> {
     pub(super) s_m: f64,
     pub(super) length_m: f64,
@@ -53,7 +53,7 @@ pub(super) struct Stretch<'a> {
     pub(super) lane_offset: &'a Profile,
 }
 
-/// Refuses sections whose width polynomials leave what a road can be.
+/// Refuses sections whose width polynomials exceed the limits of a road.
 fn check_widths(element: Element, section: &LaneSection, length_m: f64) -> Result<(), OpenDriveError> {
     let widest = |width: &Profile| (0..=20).map(|i| width.at(length_m * f64::from(i) / 20.0)).fold(0.0, f64::max);
     match section.left.iter().chain(&section.right).map(|lane| widest(&lane.width)).find(|&width| width > MAX_WIDTH_M) {
@@ -65,8 +65,8 @@ fn check_widths(element: Element, section: &LaneSection, length_m: f64) -> Resul
     }
 }
 
-/// Lanes of one side, from the reference line outwards. Where one cannot be told from its id, it is left out with all
-/// lanes outside it, whose place depends on it.
+/// Lanes of one side, from the reference line outwards. A lane whose id cannot be read is left out with all lanes
+/// outside it, whose position depends on it.
 fn read_side(
     section: Element,
     name: &'static str,
@@ -152,7 +152,7 @@ fn read_kind(element: Element, log: &mut FindingLog) -> LaneKind {
     }
 }
 
-/// Names the heights of lanes over the road (kerbs), which are not built.
+/// Reports the heights of lanes over the road (kerbs), which are not built.
 fn note_heights(element: Element, log: &mut FindingLog) {
     let height = |element: &Element, name| element.number_or(name, 0.0, -1e3, 1e3).unwrap_or(0.0).abs();
     let heights = children(element, "height").map(|record| height(&record, "inner").max(height(&record, "outer")));

@@ -1,11 +1,11 @@
-//! `<link>`: what the ends of a road meet, and the junction that it leads through.
+//! `<link>`: links at the ends of a road, and the junction that it leads through.
 
 use super::super::finding::FindingLog;
 use super::super::road::{Contact, Road, RoadLink};
 use super::element::Element;
 use super::{Ids, OpenDriveError};
 
-/// Fills the links of a road; those that lead to nothing in this map are treated as absent.
+/// Fills the links of a road; links to elements that are not in this map are treated as absent.
 pub(super) fn read(element: Element, road: &mut Road, ids: &Ids, log: &mut FindingLog) {
     let link = element.child("link");
     let mut end = |name| {

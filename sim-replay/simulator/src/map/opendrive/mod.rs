@@ -1,10 +1,10 @@
 //! Maps in OpenDRIVE format, versions 1.4 to 1.8.
 //!
-//! Read are reference lines (line, arc, spiral, poly3, paramPoly3), elevation, superelevation, crossfall and shape, lane
-//! offset, lane sections with widths or borders, kinds, links and speeds, traffic on either side, the connections of
-//! common and direct junctions, objects, signals, bridges and tunnels. What cannot be read or built is left out in the
-//! smallest part that can be, and named in [`RoadNetwork::findings`]. Everything from the file is bounded before it is
-//! used, so that no file can make the program panic, hang or take memory without limit.
+//! Supported: reference lines (line, arc, spiral, poly3, paramPoly3), elevation, superelevation, crossfall and shape,
+//! lane offset, lane sections with widths or borders, kinds, links and speeds, traffic on either side, the connections
+//! of common and direct junctions, objects, signals, bridges and tunnels. A part that cannot be read or built is left
+//! out, as small a part as possible, and listed in [`RoadNetwork::findings`]. Every value from the file is bounded
+//! before it is used, so that no file can cause a panic, a hang or unbounded memory.
 
 mod beside;
 mod border;
@@ -39,7 +39,7 @@ const MAX_LANES_M: f64 = 3_000_000.0;
 /// Lanes within one junction together may be at most this long, metres; the search for conflicts compares all pairs.
 const MAX_JUNCTION_M: f64 = 20_000.0;
 
-/// Places of roads and junctions by their ids in the file.
+/// Indices of roads and junctions by their ids in the file.
 struct Ids {
     roads: BTreeMap<String, usize>,
     junctions: BTreeMap<String, usize>,
@@ -48,8 +48,8 @@ struct Ids {
 /// Reads a map from the text of its file.
 ///
 /// # Errors
-/// [`OpenDriveError`] where the text is no OpenDRIVE map, is larger than maps are, or holds no road that can be read;
-/// the latter with line, element, attribute and value of the first road's fault.
+/// [`OpenDriveError`] if the text is no OpenDRIVE map, exceeds a limit, or holds no road that can be read; the latter
+/// with line, element, attribute and value of the first road's fault.
 pub fn read(text: &str) -> Result<RoadNetwork, OpenDriveError> {
     check_size(text.len())?;
     read_text(text, FindingLog::default())
@@ -151,7 +151,7 @@ fn check_total(element: Element, what: &str, total_m: f64, limit_m: f64) -> Resu
     Err(element.error_element(&format!("brings {what} to {total_m:.0} m, more than the limit of {limit_m} m")))
 }
 
-/// Elements with an id of their own, and their places by id; others are left out.
+/// Elements with an id of their own, and their indices by id; others are left out.
 fn collect_ids<'a, 'input>(
     root: Element<'a, 'input>,
     name: &'static str,

@@ -9,13 +9,14 @@ use super::element::{Element, MAX_COORDINATE_M, MAX_LENGTH_M, children};
 const MAX_CURVATURE: f64 = 10.0;
 /// Most that one element may turn, radians; bounds the cost of evaluating it.
 const MAX_TURN_RAD: f64 = 20.0;
-/// Curvatures beyond this are no numbers of a road, not even of an odd one.
+/// Curvatures beyond this are treated as invalid numbers, 1/m.
 const ANY_CURVATURE: f64 = 1e9;
-/// The elements' lengths may miss the road's length by this much, metres; rounding in the wild stays far below.
+/// The elements' lengths may differ from the road's length by this much, metres; rounding in real files stays far
+/// below.
 const LENGTH_TOLERANCE_M: f64 = 1.0;
-/// Elements may miss each other by this much, metres.
+/// Largest gap between consecutive elements, metres.
 const JOINT_TOLERANCE_M: f64 = 2.0;
-/// An element up to this length whose shape is absurd is as good as a straight line, metres.
+/// An element up to this length whose shape is implausible is replaced by a straight line, metres.
 const SHORT_M: f64 = 1.0;
 
 /// Reads a reference line; also returns the length of its road: that of the elements where the road's own differs.
@@ -89,7 +90,8 @@ fn read_curve(element: Element, log: &mut FindingLog) -> Result<Curve, OpenDrive
     checked(element, curve(shape), log)
 }
 
-/// Curvatures of an element; where one is tighter than any road bends, all are NaN: the element becomes a straight line.
+/// Curvatures of an element; where one is tighter than any road bends, all are NaN: the element becomes a straight
+/// line.
 fn curvatures<const N: usize>(
     element: Element,
     names: [&'static str; N],
@@ -143,14 +145,14 @@ fn checked(element: Element, curve: Curve, log: &mut FindingLog) -> Result<Curve
     Ok(Curve { shape: CurveShape::Line, ..curve })
 }
 
-/// Whether a curve is as long as its element up to a factor of two.
+/// True if a curve is as long as its element up to a factor of two.
 fn fits(curve: &Curve) -> bool {
     let at = |tenth: u32| curve.at(curve.length_m * f64::from(tenth) / 10.0);
     let measured_m: f64 = (0..10).map(|tenth| at(tenth).distance_m(&at(tenth + 1))).sum();
     measured_m > 0.5 * curve.length_m && measured_m < 2.0 * curve.length_m
 }
 
-/// Whether no tenth of a curve is longer than twice what its length says: polynomials can claim anything.
+/// True if no tenth of a curve is longer than twice its nominal length, which arbitrary polynomials may exceed.
 fn keeps_its_length(curve: &Curve) -> bool {
     let at = |tenth: u32| curve.at(curve.length_m * f64::from(tenth) / 10.0);
     (0..10).all(|tenth| at(tenth).distance_m(&at(tenth + 1)) <= 0.2 * curve.length_m + 0.1)

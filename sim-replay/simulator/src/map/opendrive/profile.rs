@@ -1,4 +1,4 @@
-//! Values along a road as cubics, and how a road lies across: `<lateralProfile>`.
+//! Values along a road as cubics, and the road's cross-sections: `<lateralProfile>`.
 
 use super::super::finding::FindingLog;
 use super::super::lateral::{CrossShape, LateralProfile, MAX_SHAPE_M, MAX_SLOPE_RAD};
@@ -7,7 +7,7 @@ use super::super::road::MAX_OFFSET_M;
 use super::OpenDriveError;
 use super::element::{Element, MAX_LENGTH_M, children};
 
-/// Looks along a road for slopes that no road has.
+/// Samples along a road at which slopes are checked.
 const LOOKS: u32 = 50;
 
 /// Cubics a, b, c, d from the elements `name` of `parent`, by rising `start`.
@@ -29,7 +29,7 @@ pub(super) fn read_profile(
     Ok(Profile { records })
 }
 
-/// Reads how a road lies across. A part that cannot be read, or is steeper than any road, is left out.
+/// Reads the cross-sections of a road. A part that cannot be read, or is steeper than the limit, is left out.
 pub(super) fn read_lateral(road: Element, length_m: f64, log: &mut FindingLog) -> LateralProfile {
     let mut lateral = LateralProfile::default();
     let Some(element) = road.child("lateralProfile") else { return lateral };
@@ -48,7 +48,7 @@ pub(super) fn read_lateral(road: Element, length_m: f64, log: &mut FindingLog) -
     for other in element.elements() {
         if !matches!(other.name(), "superelevation" | "crossfall" | "shape" | "userData") {
             let found = format!("up to {:.2} m high", highest_constant_m(other));
-            other.note(log, &found, "left out: the road lies as without it");
+            other.note(log, &found, "left out: the road is built without it");
         }
     }
     lateral
@@ -65,7 +65,7 @@ fn slope(
         Ok(profile) if is_zero(&profile) => return Profile::default(),
         Ok(profile) => profile,
         Err(error) => {
-            error.note(log, "left out: the road lies as without it");
+            error.note(log, "left out: the road is built without it");
             return Profile::default();
         }
     };
@@ -73,7 +73,7 @@ fn slope(
     let steepest = steepest.map(f64::abs).fold(0.0, f64::max);
     if steepest > MAX_SLOPE_RAD {
         let found = format!("holds <{name}> up to {steepest:.2} rad, expected at most {MAX_SLOPE_RAD}");
-        parent.note(log, &found, "left out: the road lies as without it");
+        parent.note(log, &found, "left out: the road is built without it");
         return Profile::default();
     }
     profile
@@ -118,7 +118,7 @@ fn is_zero(profile: &Profile) -> bool {
     profile.records.iter().all(|(_, coefficients)| coefficients.iter().all(|&coefficient| coefficient == 0.0))
 }
 
-/// The largest constant of an element's descendants, metres: how high a surface is that is not built.
+/// The largest constant of an element's descendants, metres: the height of a surface that is not built.
 fn highest_constant_m(element: Element) -> f64 {
     element.largest("constant", "a")
 }

@@ -1,4 +1,4 @@
-//! `<road>`: a road from its parts, without its links.
+//! `<road>`: reads a road from its parts, without its links.
 
 use super::super::finding::FindingLog;
 use super::super::profile::Profile;
@@ -11,10 +11,10 @@ use super::{OpenDriveError, beside, lanes, plan_view};
 /// Highest road over the map's zero, metres.
 const MAX_HEIGHT_M: f64 = 10_000.0;
 
-/// Reads a road whose links are not known yet.
+/// Reads a road whose links are not resolved yet.
 ///
 /// # Errors
-/// Where its line, heights or lanes cannot be read: without them there is no road.
+/// If its reference line, heights or lanes cannot be read.
 pub(super) fn read(element: Element, log: &mut FindingLog) -> Result<Road, OpenDriveError> {
     let (plan_view, length_m) = plan_view::read(element, log)?;
     let lanes = element.required("lanes")?;
@@ -66,7 +66,7 @@ fn read_speed_limits(road: Element, log: &mut FindingLog) -> Vec<(f64, f64)> {
     limits
 }
 
-/// Names what is not read of a road and could change where its surface lies.
+/// Reports the parts of a road that are not read and could change the height of its surface.
 fn note_unread(road: Element, log: &mut FindingLog) {
     for element in road.elements() {
         match element.name() {
@@ -74,10 +74,10 @@ fn note_unread(road: Element, log: &mut FindingLog) {
             | "railroad" | "userData" | "dataQuality" => {}
             "surface" => {
                 for surface in element.elements().filter(|surface| surface.name() != "userData") {
-                    surface.note_value(log, "file", "left out: the road lies as without it");
+                    surface.note_value(log, "file", "left out: the road is built without it");
                 }
             }
-            _ => element.note(log, "is not known here", "left out"),
+            _ => element.note(log, "is not supported", "left out"),
         }
     }
 }

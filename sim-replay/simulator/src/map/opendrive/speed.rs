@@ -3,12 +3,12 @@
 use super::super::finding::FindingLog;
 use super::element::Element;
 
-/// Driven where the map has no limit: 130 km/h, metres per second.
+/// Speed limit where the map has none: 130 km/h, metres per second.
 const UNLIMITED_MPS: f64 = 130.0 / 3.6;
-/// Higher limits are no limits, in any unit.
+/// Higher limits are treated as invalid, in any unit.
 const MAX_LIMIT: f64 = 1000.0;
 
-/// A speed limit in metres per second; `None` where it is undefined, or odd and treated so.
+/// A speed limit in metres per second; `None` where it is undefined or invalid.
 pub(super) fn read_speed(element: Element, log: &mut FindingLog) -> Option<f64> {
     match element.optional_text("max").map(str::trim) {
         Some("undefined") => return None,

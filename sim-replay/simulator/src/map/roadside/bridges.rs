@@ -14,8 +14,8 @@ const BRIDGE_M: f64 = 1.2;
 const SLAB_M: [f64; 2] = [0.25, 0.8];
 /// Distance between rows of pillars, metres.
 const PILLARS_M: f64 = 14.0;
-/// How far from the edge of a road the height of its surroundings is taken, metres; the terrain follows the road to
-/// about two cells beyond its edge.
+/// Distance from the edge of a road at which the height of its surroundings is taken, metres; the terrain follows the
+/// road to about two cells beyond its edge.
 const BESIDE_M: f64 = 4.5;
 /// Surroundings higher than this are held by a wall, metres.
 const RETAINED_M: f64 = 0.9;

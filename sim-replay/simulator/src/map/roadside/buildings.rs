@@ -1,7 +1,7 @@
 //! Buildings, each composed of boxes and cylinders within its lot.
 //!
-//! A building stands on a [`PartFootprint`] in the middle of its lot that looks along the street, with the street on its right:
-//! `u` runs along the street, `v` away from it. Nothing reaches beyond the lot.
+//! A building has its [`PartFootprint`] in the centre of its lot, facing along the street, with the street on its
+//! right: `u` runs along the street, `v` away from it. No part reaches beyond the lot.
 
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
@@ -9,7 +9,7 @@ use rand_chacha::ChaCha8Rng;
 use super::super::{Solid, SolidKind};
 use super::parts::PartFootprint;
 
-/// How far buildings reach into the ground, so that none floats on a slope, metres.
+/// Depth to which buildings reach into the ground, so that none floats on a slope, metres.
 const FOOTING_M: f64 = 1.0;
 
 /// Kinds of buildings.
@@ -72,7 +72,7 @@ pub(super) fn build(style: Style, lot: &Lot, rng: &mut ChaCha8Rng) -> Vec<Solid>
     draft.parts
 }
 
-/// A building while it grows.
+/// A building under construction.
 struct Draft {
     foot: PartFootprint,
     reflectivity: f32,

@@ -1,15 +1,15 @@
-//! The two sides of every road, as places to put things along.
+//! Frontage: the two sides of every road, along which objects are placed.
 
 use super::super::curve::Pose2;
 use super::super::road::{LaneKind, Road, RoadNetwork};
 use super::super::surface::Surface;
 
-/// Roads on which one may go this fast have no houses along them, metres per second.
+/// Roads with at least this speed limit have no houses along them, metres per second.
 const FAST_MPS: f64 = 17.0;
 /// From this width on, a fast road is a motorway, metres.
 const MOTORWAY_WIDTH_M: f64 = 6.5;
 
-/// What a side of a road is like.
+/// Character of a side of a road.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Zone {
     /// Houses, pavements, lamps.
@@ -28,9 +28,9 @@ pub(super) struct Side {
     pub sign: f64,
     pub zone: Zone,
     pub length_m: f64,
-    /// Whether traffic on this side leads along the road's own direction.
+    /// True if traffic on this side leads along the road's own direction.
     pub along: bool,
-    /// Whether nothing but the other direction's traffic is expected here: the left of a one-way motorway.
+    /// True for the left side of a one-way motorway, with only the opposite carriageway beyond it.
     pub median: bool,
 }
 
@@ -51,7 +51,7 @@ pub(super) fn sides(network: &RoadNetwork) -> Vec<Side> {
 }
 
 impl Side {
-    /// The place `out_m` beyond what is paved, `s_m` along the road (also a little before its start or behind its end),
+    /// The pose `out_m` beyond the paved area, `s_m` along the road (also a little before its start or behind its end),
     /// looking along the road.
     pub(super) fn beyond_paved(&self, surface: &Surface, network: &RoadNetwork, s_m: f64, out_m: f64) -> Pose2 {
         self.beyond(surface, network, s_m, out_m, |cut| cut.paved_m)
@@ -73,8 +73,8 @@ impl Side {
         z_m + cut.height_m(cut.carriageway_m[usize::from(self.sign > 0.0)]) - cut.z_m
     }
 
-    /// Whether traffic passes close by this side, rather than oncoming traffic between: the right side where traffic
-    /// keeps right.
+    /// True if the traffic nearest to this side moves in the side's own direction: the right side where traffic keeps
+    /// right.
     pub(super) fn is_near(&self, network: &RoadNetwork) -> bool {
         ((self.sign < 0.0) == self.along) != network.roads[self.road].left_hand
     }

@@ -17,8 +17,8 @@ const AISLE_M: f64 = 6.4;
 /// Depth of a lot with two rows, metres.
 pub(super) const DEPTH_M: f64 = 2.0 * BAY_M[0] + AISLE_M + 1.4;
 
-/// Fills `lot` (free ground of at least [`DEPTH_M`] depth) with two rows of bays, lamps or trees between them and a wall
-/// at the back.
+/// Fills `lot` (free ground of at least [`DEPTH_M`] depth) with two rows of bays, lamps or trees between them and a
+/// wall at the back.
 pub(super) fn fill(site: &mut Site, lot: &Lot, rng: &mut ChaCha8Rng) {
     let count = ((lot.width_m - 1.0) / BAY_M[1]).floor() as u32;
     let island = rng.random_range(2..=4.max(count / 2));

@@ -1,6 +1,6 @@
-//! What stands beside the roads: placed by frontage, for any road network.
+//! Roadside objects: placed along the frontage of any road network.
 //!
-//! Every group of things has its own random stream, so that a change to one leaves the others as they were.
+//! Every group of objects has its own random stream, so that a change to one leaves the others unchanged.
 
 mod barriers;
 mod bridges;
@@ -25,7 +25,7 @@ use super::surface::Surface;
 use super::{ParkingSpot, Solid};
 use site::Site;
 
-/// Solids and parking spots of the town of a seed.
+/// Solids and parking spots of the map of a seed.
 pub(super) fn place_roadside(
     layout: &Layout,
     surface: &Surface,

@@ -1,4 +1,4 @@
-//! What makes one stretch of motorway differ from the next: noise walls, gantries, overpasses, trees, halls, masts.
+//! Motorway scenery that makes stretches distinguishable: noise walls, gantries, overpasses, trees, halls, masts.
 
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
@@ -12,7 +12,7 @@ use super::parts::{PartFootprint, wall};
 use super::site::{HEADROOM_M, Site};
 use super::trees::{Species, plant};
 
-/// Places what stands along motorways.
+/// Places the objects along motorways.
 pub(super) fn place(site: &mut Site, rng: &mut ChaCha8Rng) {
     for side in sides(site.network) {
         if side.zone != Zone::Motorway || side.median {

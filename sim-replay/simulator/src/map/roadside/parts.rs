@@ -1,9 +1,9 @@
-//! Small builders of solids, by the place where they stand.
+//! Builders of small solids, relative to a foot pose.
 
 use super::super::curve::Pose2;
 use super::super::{Shape, Solid, SolidKind};
 
-/// Where a group of solids stands: plan pose and the height of its foot, metres.
+/// Foot of a group of solids: plan pose and height, metres.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct PartFootprint {
     pub pose: Pose2,

@@ -14,7 +14,7 @@ use super::trees::{Species, plant};
 
 /// Ground that falls or rises more than this over a lot is not built on, metres.
 const MAX_SLOPE_M: f64 = 2.5;
-/// How far plots reach beyond the ends of a road, around the corner, metres.
+/// Length by which plots reach beyond the ends of a road, around the corner, metres.
 const CORNER_M: f64 = 9.0;
 /// Height up to which a lot is kept free, metres.
 const LOT_HEIGHT_M: f64 = 40.0;
@@ -30,7 +30,7 @@ pub(super) fn place(site: &mut Site, rng: &mut ChaCha8Rng) {
     }
 }
 
-/// What a street is like: its houses have something in common.
+/// Character of a street, common to its houses.
 struct Character {
     styles: Vec<Style>,
     set_back_m: f64,
@@ -62,7 +62,7 @@ fn along_street(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
                 let [width, depth] = style.lot_m(rng);
                 let set_back = character.set_back_m + rng.random_range(0.0..1.8);
                 building(site, side, s, [width, depth], set_back, style, rng)
-                    // A house fits where nothing else does.
+                    // A small house where nothing else fits.
                     .or_else(|| building(site, side, s, [8.2, 8.0], 0.8 + set_back * 0.5, Style::House, rng))
                     .map(|end| end + character.gap_m * rng.random_range(0.4..2.2))
             }
@@ -94,7 +94,7 @@ fn along_country_road(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
     }
 }
 
-/// The lot `width` x `depth` from `s` on, `set_back` behind what is paved, if it is free and level enough.
+/// The lot `width` x `depth` from `s` on, `set_back` behind the paved area, if it is free and level enough.
 fn free_lot(site: &Site, side: &Side, s: f64, [width, depth]: [f64; 2], set_back: f64) -> Option<Lot> {
     let middle = s + width / 2.0;
     // On a bend the front's middle and its ends lie at different distances; the free test settles it.
@@ -110,7 +110,7 @@ fn free_lot(site: &Site, side: &Side, s: f64, [width, depth]: [f64; 2], set_back
     free.then(|| Lot { foot: PartFootprint::new(pose, low), width_m: width, depth_m: depth })
 }
 
-/// Builds, with a garden in front and trees behind; returns where the lot ends along the street.
+/// Places a building, with a garden in front and trees behind; returns the end of the lot along the street.
 fn building(
     site: &mut Site,
     side: &Side,
@@ -133,7 +133,7 @@ fn building(
     Some(s + size[0])
 }
 
-/// What divides a plot from the pavement: wall, fence, hedge, steps of bushes, or nothing.
+/// Boundary between a plot and the pavement: wall, fence, hedge, steps of bushes, or nothing.
 fn front(site: &mut Site, lot: &Lot, set_back: f64, rng: &mut ChaCha8Rng) {
     if set_back < 1.6 {
         return;
@@ -212,7 +212,7 @@ fn green(site: &mut Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) -> Option<f
     Some(s + width)
 }
 
-/// Something to remember a place by.
+/// A monument, as a landmark.
 pub(super) fn monument(foot: PartFootprint, rng: &mut ChaCha8Rng) -> Vec<Solid> {
     let base = rng.random_range(1.6..3.2);
     let mut parts = vec![foot.cuboid(SolidKind::StreetFurniture, [0.0, 0.0, -0.3], [base, base, 1.0], 0.5)];
@@ -235,7 +235,7 @@ pub(super) fn monument(foot: PartFootprint, rng: &mut ChaCha8Rng) -> Vec<Solid> 
     parts
 }
 
-/// A fence along a field; returns where it ends.
+/// A fence along a field; returns its end.
 fn fence(site: &mut Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) -> f64 {
     let (length, out) = (rng.random_range(15.0..45.0), rng.random_range(2.0..4.0));
     let height = rng.random_range(0.8..1.5);

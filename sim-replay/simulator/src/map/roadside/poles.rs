@@ -13,7 +13,7 @@ use super::site::Site;
 /// Radius of ordinary posts, metres.
 const POST_M: f64 = 0.08;
 
-/// Places everything that stands on a post, first what the map records, then our own.
+/// Places every object on a post: first those in the map, then procedural ones.
 pub(super) fn place(site: &mut Site, rng: &mut ChaCha8Rng) {
     let recorded_lights = place_recorded(site, rng);
     for side in sides(site.network) {
@@ -34,7 +34,7 @@ pub(super) fn place(site: &mut Site, rng: &mut ChaCha8Rng) {
     }
 }
 
-/// Signals and signs of the map; whether it has traffic lights.
+/// Signals and signs of the map; returns true if it has traffic lights.
 fn place_recorded(site: &mut Site, rng: &mut ChaCha8Rng) -> bool {
     let mut lights = false;
     for index in 0..site.network.roads.len() {
@@ -56,7 +56,7 @@ fn place_recorded(site: &mut Site, rng: &mut ChaCha8Rng) -> bool {
     lights
 }
 
-/// A place that a map gives by `s` and `t`, turned by `heading_rad`.
+/// A pose that a map gives by `s` and `t`, turned by `heading_rad`.
 fn beside_line(road: &Road, s_m: f64, t_m: f64, heading_rad: f64) -> Pose2 {
     let [aside_m, _] = road.aside_m(road.section_at(s_m), s_m, t_m);
     road.pose_at(s_m).moved(0.0, aside_m, heading_rad)
@@ -80,7 +80,7 @@ fn beside_carriageway(site: &mut Site, parts: &[Solid], t_m: f64) {
     }
 }
 
-/// Things the map paints on the road are no signs.
+/// False for markings that the map paints on the road.
 fn is_sign(label: &str) -> bool {
     let label = label.to_ascii_lowercase();
     let painted = ["stencil", "line", "crosswalk", "solid", "dashed", "arrow"];
@@ -145,7 +145,7 @@ fn traffic_light(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
     let road = &site.network.roads[side.road];
     let (link, s) = if side.along { (road.successor, side.length_m - 0.6) } else { (road.predecessor, 0.6) };
     let Some(RoadLink::Junction(junction)) = link else { return };
-    // The same answer for every road of the junction.
+    // The same result for every road of the junction.
     let lit = !(junction * 7 + site.network.junctions[junction].connections.len()).is_multiple_of(3);
     if !lit || !side.is_near(site.network) {
         return;

@@ -1,4 +1,4 @@
-//! The ground plan while it fills: what is taken, and what has been placed.
+//! Ground plan of a scene: outlines that are occupied, and solids that have been placed.
 
 pub(super) use super::super::clearance::outline;
 use super::super::convex::{CellIndex, Quad, Rectangle, bounds, overlap};
@@ -15,7 +15,7 @@ const CELL_M: f64 = 6.0;
 /// Junctions larger than this are not kept free between their lanes, metres.
 const MAX_JUNCTION_M: f64 = 70.0;
 
-/// A town in the making.
+/// A scene under construction.
 pub(super) struct Site<'a> {
     pub network: &'a RoadNetwork,
     pub surface: &'a Surface,
@@ -38,7 +38,7 @@ impl<'a> Site<'a> {
         site
     }
 
-    /// Whether a rectangle is free of roads and of everything placed, between two heights.
+    /// True if a rectangle is free of roads and of everything placed, between two heights.
     pub(super) fn is_free(&self, rectangle: &Rectangle, z_m: [f64; 2], pavements: bool) -> bool {
         self.surface.is_clear(rectangle, z_m, HEADROOM_M, pavements) && !self.is_taken(&rectangle.corners(), z_m)
     }
@@ -60,7 +60,7 @@ impl<'a> Site<'a> {
         free
     }
 
-    /// Places parts wherever they are: for what belongs to a road, or stands on ground taken before.
+    /// Places parts without a check: for parts of a road, or parts on ground reserved before.
     pub(super) fn place(&mut self, parts: &[Solid]) {
         for part in parts {
             self.take(&outline(part), [part.bottom_m(), part.top_m()]);
@@ -97,7 +97,7 @@ impl<'a> Site<'a> {
         self.taken.push((outline, z_m));
     }
 
-    /// Takes the hull of a junction's lanes, so that nothing ends up between them.
+    /// Reserves the hull of a junction's lanes, so that nothing is placed between them.
     fn keep_junction_free(&mut self, junction: usize) {
         let inside = |road: u32| self.network.roads[road as usize].junction == Some(junction);
         let patches = self.surface.patches.iter().filter(|patch| patch.carriageway && inside(patch.road));

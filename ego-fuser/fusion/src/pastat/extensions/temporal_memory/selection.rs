@@ -2,30 +2,31 @@
 
 use tch::{Kind, TchError, Tensor};
 
-/// A cell and those beside it.
+/// A cell and its eight neighbours.
 pub(super) const AROUND: i64 = 9;
-/// So many cells around a patch count as much as its own: a vehicle's cell says that it is there, others show its outline.
+/// Margin around a patch, cells, whose likelihood counts as the patch's own: one cell gives the presence of a vehicle,
+/// others its outline.
 const MARGIN_CELLS: i64 = 2;
 
-/// How far those lie below and right of the first of them, row by row.
+/// Offsets of the nine cells, rows and columns from the first, row by row.
 const BESIDE: [[usize; 2]; AROUND as usize] = [[0, 0], [0, 1], [0, 2], [1, 0], [1, 1], [1, 2], [2, 0], [2, 1], [2, 2]];
 
-/// The cells of a few patches, patch by patch and row by row, and what lies beside them.
+/// The cells of a few patches, patch by patch and row by row, and their neighbours.
 #[derive(Debug)]
 pub(super) struct Selection {
     /// `K`: their patches, counted row by row.
     pub(super) patches: Vec<i64>,
     /// `P`: the cells of those, counted row by row.
     pub(super) cells: Vec<i64>,
-    /// `R`: row and column of these cells and of those beside them, each once, in the order of the lattice.
+    /// `R`: row and column of these cells and of their neighbours, each once, in the order of the grid.
     pub(super) near: Vec<[usize; 2]>,
-    /// `P * 9`: of each cell the places in `near` of the cells around it, row by row; `R` for what is beyond the edge.
+    /// `P * 9`: for each cell the indices in `near` of the cells around it, row by row; `R` for cells beyond the edge.
     pub(super) around: Vec<i64>,
 }
 
 impl Selection {
-    /// A `share` of all patches of `patch` cells along each edge, at least one: those in or close to which a vehicle is most
-    /// likely, which `likely` `[1, 1, H, W]` tells. H and W are multiples of `patch`.
+    /// A `share` of all patches of `patch` cells along each edge, at least one: those with the highest likelihood of a
+    /// vehicle in or close to them by `likely` `[1, 1, H, W]`. H and W are multiples of `patch`.
     pub(super) fn most_likely(likely: &Tensor, patch: i64, share: f64) -> Result<Self, TchError> {
         let (_, _, height, width) = likely.size4()?;
         let window = patch + 2 * MARGIN_CELLS;

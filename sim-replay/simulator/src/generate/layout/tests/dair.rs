@@ -1,4 +1,4 @@
-//! DAIR-V2X-C and V2X-Seq SPD, read by the description of their files.
+//! DAIR-V2X-C and V2X-Seq SPD, read according to the description of their files.
 
 use std::path::Path;
 

@@ -12,7 +12,7 @@ use crate::generate::{ConvertOptions, SynthOptions, Weather, convert, generate};
 use dataset::Layout;
 use dataset::frame::{Frame, Object, ObjectClass};
 
-/// A line for each layout, when there is a reader of it.
+/// Layouts for which there is a reader.
 const LAYOUTS: [(SceneLayout, Layout); 2] =
     [(SceneLayout::V2v4real, Layout::V2v4Real), (SceneLayout::V2xreal, Layout::V2xReal)];
 
@@ -45,7 +45,7 @@ fn a_converted_data_set_is_the_same_as_a_generated_one() {
     assert_same(&ticks(&back), &expected, SceneLayout::Opv2v);
     let names = |path| open(path).scenarios.iter().map(|scenario| scenario.name.clone()).collect::<Vec<_>>();
     assert_eq!(names(first.path()), names(third.path()));
-    // What lies there is not written over unasked.
+    // Existing files are not overwritten without `force`.
     let again = convert(&open(first.path()), &into(SceneLayout::Opv2v, third.path()), &|_, _| {});
     assert!(again.unwrap_err().to_string().contains("is not empty"));
 }

@@ -1,4 +1,4 @@
-//! RunScope that do not come to their end.
+//! Runs that are interrupted.
 
 use std::fs;
 
@@ -42,7 +42,7 @@ fn a_run_that_fails_leaves_its_mark() {
 }
 
 #[test]
-fn what_an_earlier_run_wrote_is_not_mixed_in() {
+fn files_of_an_earlier_run_are_not_mixed_in() {
     for layout in [SceneLayout::KittiObject, SceneLayout::V2xsim, SceneLayout::Nclt] {
         let folder = tempfile::tempdir().unwrap();
         let count = |scenes: usize, force: bool| {

@@ -1,7 +1,7 @@
 //! One scene in every layout: the same poses, points and boxes.
 //!
-//! What a reader of this crate opens is read by it. The others are read by a few lines here that follow the description of
-//! the format and share nothing with the writers.
+//! Layouts with a reader in `dataset` are read by it. The others are read by a few lines here that follow the
+//! description of the format and share nothing with the writers.
 
 mod dair;
 mod family;
@@ -22,7 +22,7 @@ use dataset::frame::{Frame, Object};
 use dataset::ground_truth::upright_box;
 use dataset::{self, Dataset, LoadOptions};
 
-/// Two scenes of two agents at two moments.
+/// Two scenes of two agents at two capture times.
 fn options(layout: SceneLayout, out: &Path) -> SynthOptions {
     let options = SynthOptions::new(Subset::V2vdet, 7, out.to_owned());
     SynthOptions { layout, scenes: 2, frames: 2, agents: 2..=2, ..options }
@@ -32,17 +32,17 @@ fn write(layout: SceneLayout, out: &Path) -> Summary {
     generate(&options(layout, out), &|_| {}).unwrap()
 }
 
-/// What a data set holds of one moment.
+/// Content of a data set at one capture time.
 #[derive(Debug, Clone, Default)]
 struct Tick {
     /// `world_from_lidar` of each agent, ego first.
     poses: Vec<Isometry3<f64>>,
     clouds: Vec<Vec<[f32; 4]>>,
-    /// All objects that any agent lists, upright in the frame of the ego's LiDAR.
+    /// All objects listed by any agent, upright in the frame of the ego's LiDAR.
     boxes: Vec<Box3d>,
 }
 
-/// Frames of one moment, ego first.
+/// Frames of one capture time, ego first.
 fn tick_of(frames: &[Frame]) -> Tick {
     let poses: Vec<_> = frames.iter().map(|frame| frame.world_from_lidar.unwrap().isometry()).collect();
     let ego_from_world = poses[0].inverse();
@@ -55,7 +55,7 @@ fn tick_of(frames: &[Frame]) -> Tick {
     }
 }
 
-/// All moments of all scenarios in order, as the reader finds them.
+/// All capture times of all scenarios in order, as read.
 fn ticks(dataset: &Dataset) -> Vec<Tick> {
     let mut ticks = Vec::new();
     for scenario in &dataset.scenarios {
@@ -100,7 +100,7 @@ fn assert_same(ticks: &[Tick], expected: &[Tick], layout: SceneLayout) {
 
 fn assert_same_pose(pose: &Isometry3<f64>, expected: &Isometry3<f64>, layout: SceneLayout) {
     let distance = (pose.translation.vector - expected.translation.vector).norm();
-    // Towns are some hundred metres wide, where the last bit of a double is 1e-13 m.
+    // Maps are some hundred metres wide, where the last bit of a double is 1e-13 m.
     assert!(distance < 1e-9 && pose.rotation.angle_to(&expected.rotation) < 1e-7, "{layout:?}: {distance}");
 }
 

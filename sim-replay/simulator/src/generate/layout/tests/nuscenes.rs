@@ -1,4 +1,4 @@
-//! V2X-Sim and Open MARS, read by the description of nuScenes' tables.
+//! V2X-Sim and Open MARS, read according to the description of nuScenes' tables.
 
 use std::collections::HashMap;
 use std::path::Path;

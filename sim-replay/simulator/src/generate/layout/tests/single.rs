@@ -4,7 +4,7 @@ use super::{Tick, assert_same_boxes, assert_same_points, assert_same_pose, expec
 use crate::generate::SceneLayout;
 use dataset::Layout;
 
-/// The moments of each agent of each scene, in the order of the sequences.
+/// The capture times of each agent of each scene, in the order of the sequences.
 fn by_agent(ticks: &[Tick]) -> Vec<Vec<Tick>> {
     let alone = |tick: &Tick, agent: usize| Tick {
         poses: vec![tick.poses[agent]],
@@ -15,7 +15,7 @@ fn by_agent(ticks: &[Tick]) -> Vec<Vec<Tick>> {
     scenes.flat_map(|scene| (0..2).map(move |agent| scene.iter().map(|tick| alone(tick, agent)).collect())).collect()
 }
 
-/// Sequences as they are read, with the number of boxes that the summary says were left out.
+/// Sequences as read, with the number of boxes that the summary counts as left out.
 fn sequences(layout: SceneLayout, found: Layout) -> (Vec<Vec<Tick>>, Vec<u64>) {
     let folder = tempfile::tempdir().unwrap();
     let summary = write(layout, folder.path());
@@ -79,7 +79,7 @@ fn kitti_odometry_keeps_motions_and_points() {
 }
 
 #[test]
-fn kitti_object_keeps_what_each_agent_lists() {
+fn kitti_object_keeps_the_objects_of_each_agent() {
     let [folder, other] = [(); 2].map(|()| tempfile::tempdir().unwrap());
     write(SceneLayout::KittiObject, folder.path());
     let found = ticks(&open(folder.path()));

@@ -1,4 +1,4 @@
-//! V2X-Real, read by the description of its files.
+//! V2X-Real, read according to the description of its files.
 
 use std::path::{Path, PathBuf};
 

@@ -1,10 +1,11 @@
-//! Lane borders, speeds, shapes of lines and links of kinds that files of other writers hold.
+//! Lane borders, speeds, shapes of lines and links as written by other tools.
 
 use super::super::super::lane::LaneGraph;
 use super::super::super::road::Road;
 use super::*;
 
-/// Two sections with borders: signed on the first, without their sign on the right of the second, one lane with a width.
+/// Two sections with borders: signed on the first, without their sign on the right of the second, one lane with a
+/// width.
 pub(super) const BORDERS: &str = r#"<OpenDRIVE xmlns="http://code.asam.net/simulation/standard/opendrive_schema">
   <road id="1" length="60" junction="-1">
     <planView><geometry s="0" x="0" y="0" hdg="0" length="60"><line/></geometry></planView>
@@ -31,7 +32,7 @@ pub(super) const BORDERS: &str = r#"<OpenDRIVE xmlns="http://code.asam.net/simul
   </road>
 </OpenDRIVE>"#;
 
-/// A road of 50 m with one lane, around what a test is about.
+/// A road of 50 m with one lane, around the element under test.
 fn one_road(attributes: &str, geometry: &str, lane: &str) -> String {
     format!(
         r#"<OpenDRIVE><road id="r" length="50" junction="-1" {attributes}>
@@ -197,14 +198,14 @@ fn files_of_every_encoding_give_the_same_map() {
 }
 
 #[test]
-fn what_is_not_built_is_named() {
+fn parts_that_are_not_built_are_reported() {
     for (from, to, named) in [
         (
             "<lanes>",
             "<surface><CRG file=\"a.crg\"/></surface><lanes>",
-            "<CRG> file=\"a.crg\"; left out: the road lies as without it",
+            "<CRG> file=\"a.crg\"; left out: the road is built without it",
         ),
-        ("<lanes>", "<weather/><lanes>", "<weather> is not known here; left out"),
+        ("<lanes>", "<weather/><lanes>", "<weather> is not supported; left out"),
         ("<header", "<include file=\"b.xodr\"/><header", "<include> file=\"b.xodr\"; left out"),
         (
             "type=\"sidewalk\">",
@@ -241,7 +242,7 @@ fn sections_without_lane_links_go_on_where_they_are_one_lane_and_links_that_do_n
     let linked = counts(BORDERS);
     assert_eq!((linked.made, linked.refused, linked.findings.len()), (3, 0, 0));
     let found = counts(&unlinked(BORDERS));
-    let named = "road 1: <link> leads from lane -2 to no lane, though lane -2 goes on; lanes of one id linked";
+    let named = "road 1: <link> leads from lane -2 to no lane, though lane -2 continues; lanes of one id linked";
     assert_eq!((found.made, found.findings[0].to_string().as_str()), (3, named));
     // A lane that is linked from one side only, or is another one, ends.
     assert_eq!(counts(&BORDERS.replacen("<successor id=\"-2\"/>", "", 1)).made, 2);

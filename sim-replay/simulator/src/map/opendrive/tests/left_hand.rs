@@ -79,7 +79,7 @@ fn the_rule_is_that_of_each_road_and_right_hand_traffic_is_the_default() {
         let graph = graph(&SMALL.replacen(r#" name="">"#, &format!("{rule}>"), 1));
         assert!(graph.lanes.iter().any(|lane| lane.centerline[0][1] < 0.0 && lane.start_heading_rad().abs() < 1e-9));
     }
-    // One road of a map alone: its neighbour keeps right and their lanes do not meet.
+    // One road of a map keeps left; its neighbour keeps right and their lanes do not meet.
     let network = read(&SMALL.replacen(r#" name="">"#, r#" rule="LHT">"#, 1)).unwrap();
     assert_eq!(network.roads.iter().map(|road| road.left_hand).collect::<Vec<_>>(), [true, false]);
     let (graph, _) = lane_builder::lane_graph(&network);

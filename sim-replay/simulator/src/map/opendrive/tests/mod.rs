@@ -54,7 +54,7 @@ fn error_of(from: &str, to: &str) -> String {
     read(&SMALL.replacen(from, to, 1)).expect_err("the change should be refused").to_string()
 }
 
-/// What the small map leaves out when it is changed so that one road cannot be built.
+/// Findings of the small map when it is changed so that one road cannot be built.
 fn left_out(from: &str, to: &str) -> String {
     let (network, mut findings) = changed(from, to);
     assert_eq!(network.roads.len(), 1, "{findings:?}");
@@ -84,7 +84,7 @@ fn small_map_is_read_and_its_lanes_follow_each_other() {
 }
 
 #[test]
-fn what_is_no_map_is_refused() {
+fn a_file_that_is_no_map_is_refused() {
     assert!(error_of("</OpenDRIVE>", "").contains("not well-formed XML"));
     assert!(error_of("<OpenDRIVE>", "<!DOCTYPE a [<!ENTITY b \"c\">]><OpenDRIVE>").contains("not well-formed XML"));
     let text = SMALL.replace("<OpenDRIVE>", "<Other>").replace("</OpenDRIVE>", "</Other>");
@@ -111,7 +111,7 @@ fn a_road_that_cannot_be_built_is_left_out_with_line_element_attribute_and_value
         "line 21: <road> id=\"a\", expected used by one element only; left out"
     );
     assert!(left_out("<line/>", "<helix/>").contains("holds <helix>"));
-    // The road that leads to it loses its link, and that is named too.
+    // The road that leads to it loses its link, and a finding names that too.
     let (network, findings) = changed(r#"y="0" hdg="0" length="31.4159265""#, r#"y="nowhere" length="31.4159265""#);
     assert_eq!(network.roads[0].successor, None);
     assert_eq!(
@@ -151,7 +151,7 @@ fn an_odd_part_of_a_road_is_treated_as_absent_and_named() {
 }
 
 #[test]
-fn cubics_that_lead_anywhere_are_held_within_what_a_road_can_be() {
+fn unbounded_cubics_are_clamped_to_the_limits_of_a_road() {
     let wild = [
         (r#"laneOffset s="0" a="0" b="0""#, r#"laneOffset s="0" a="0" b="10000000""#),
         (r#"laneOffset s="0" a="0" b="0" c="0" d="0""#, r#"laneOffset s="0" a="0" b="0" c="0" d="-9999999""#),
@@ -193,7 +193,7 @@ fn deep_nesting_and_large_files_are_refused_or_read_without_overflow() {
 /// A document of every kind that is read, small enough to be damaged anywhere.
 const KINDS: [&str; 4] = [SMALL, kinds::BORDERS, direct::EXIT, lateral::BANKED];
 
-/// Whatever can be read can be built, down to the ground and its decks.
+/// Builds a network that was read, down to the ground and its decks.
 fn build_all(network: &RoadNetwork) {
     let (graph, _) = lane_builder::lane_graph(network);
     for lane in &graph.lanes {

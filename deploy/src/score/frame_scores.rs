@@ -1,4 +1,4 @@
-//! The score of a run, tick by tick, from what was detected and what was there. Knows no network and no file.
+//! Scores of a run, tick by tick, from detections and ground truth. Uses no network and no file.
 
 use std::collections::BTreeMap;
 
@@ -12,15 +12,15 @@ use super::neighbours::{self, NeighbourRecord};
 use super::open_ticks::{OpenTicks, Part, Tick};
 use super::stage_stamps::StageStamps;
 use super::true_boxes::true_boxes;
-use crate::experiment::metrics::{Answered, ByIou, Communication, Latencies, Percentiles, PoseError, PoseErrors};
+use crate::score::metrics::{Answered, ByIou, Communication, Latencies, Percentiles, PoseError, PoseErrors};
 
-/// Overlap from which a detection counts as found in `frames.csv`.
+/// IoU from which a detection counts as found in `frames.csv`.
 const FOUND_IOU: f64 = 0.5;
 
-/// A longer time between two frames is between two scenarios, nanoseconds.
+/// Gap between two frames beyond which they belong to two scenarios, nanoseconds.
 const SCENARIO_GAP_NANOS: u64 = 10_000_000_000;
 
-/// The score so far. Ticks are judged in the order of their capture times, whatever order their parts come in.
+/// Scores so far. Ticks are scored in the order of their capture times, independent of the order of their messages.
 pub struct FrameScores {
     ego: CavId,
     rule: GroundTruthRule,
@@ -39,8 +39,8 @@ pub struct FrameScores {
 }
 
 impl FrameScores {
-    /// An empty board for the detections of `ego`, judged by `rule`; a feature map of the model has `nominal_values`
-    /// numbers.
+    /// Empty scores for the detections of `ego`, with the ground-truth `rule`; a feature map of the model has
+    /// `nominal_values` values.
     #[must_use]
     pub fn new(ego: CavId, rule: GroundTruthRule, nominal_values: u64) -> Self {
         Self {
@@ -61,47 +61,47 @@ impl FrameScores {
         }
     }
 
-    /// Goes on with the results of another vehicle: in another scenario.
+    /// Continues with the results of another vehicle: in another scenario.
     pub fn change_ego(&mut self, ego: &CavId) {
         self.ego.clone_from(ego);
         self.live.forget();
     }
 
-    /// What was there at a tick.
+    /// Adds the ground truth of a tick.
     pub fn truth(&mut self, stamp: &Stamp, truth: Truth) {
         self.add(stamp, Part::Truth(truth));
     }
 
-    /// What the ego makes of a tick. A second result of the same tick (of an ego started again) does not count.
+    /// Adds the ego's result of a tick. A second result of the same tick (of a restarted ego) does not count.
     pub fn result(&mut self, stamp: &Stamp, result: Detections) {
         self.add(stamp, Part::Result(result));
     }
 
-    /// Where a vehicle believes to be at a tick.
+    /// Adds the pose estimate of a vehicle at a tick.
     pub fn pose(&mut self, stamp: &Stamp, estimate: PoseEstimate) {
         self.add(stamp, Part::Pose(estimate));
     }
 
-    /// Judges what is still open: nothing more will come.
+    /// Scores the ticks that are still open: no further message will arrive.
     pub fn close(&mut self) {
         while let Some((capture_nanos, tick)) = self.open.close_oldest() {
             self.judge(capture_nanos, tick);
         }
     }
 
-    /// The frames judged so far, in order.
+    /// Frames scored so far, in order.
     #[must_use]
     pub fn records(&self) -> &[FrameRecord] {
         &self.records
     }
 
-    /// Ticks of which the ego never told anything.
+    /// Number of ticks without a result of the ego.
     #[must_use]
     pub fn missed(&self) -> u64 {
         self.missed
     }
 
-    /// The frame most worth a picture so far: the one with the most neighbours, then true boxes.
+    /// Frame for the picture so far: the one with the most neighbours, then true boxes.
     #[must_use]
     pub fn showpiece(&self) -> Option<&JudgedFrame> {
         self.best.as_ref()
@@ -113,13 +113,13 @@ impl FrameScores {
         (by_iou(&self.scorer, Ordering::Global), by_iou(&self.scorer, Ordering::Frame))
     }
 
-    /// Average precision over all ticks, answered or not; none where results have no time of publication.
+    /// Average precision over all ticks, with or without a result; `None` if results have no time of publication.
     #[must_use]
     pub fn answered(&self) -> Option<Answered> {
         self.live.answered()
     }
 
-    /// Who is judged.
+    /// Id of the ego.
     #[must_use]
     pub fn ego(&self) -> &CavId {
         &self.ego
@@ -131,14 +131,14 @@ impl FrameScores {
         PoseErrors::of(&self.pose_errors, self.no_pose)
     }
 
-    /// Delays of all frames.
+    /// Latencies of all frames.
     #[must_use]
     pub fn latencies(&self) -> Latencies {
         let sample: Vec<f64> = self.records.iter().filter_map(|record| record.latency_ms).collect();
         Latencies { capture_to_detection: Percentiles::of(&sample) }
     }
 
-    /// Ages of all that was fused.
+    /// Ages of all fused data.
     #[must_use]
     pub fn ages(&self) -> Percentiles {
         Percentiles::of(&self.ages_ms)
@@ -148,17 +148,17 @@ impl FrameScores {
     #[must_use]
     pub fn seconds(&self) -> f64 {
         let steps = self.records.windows(2).map(|pair| pair[1].capture_nanos.saturating_sub(pair[0].capture_nanos));
-        // Where another scenario begins the clock jumps, ahead or back.
+        // The clock jumps at the start of another scenario, ahead or back.
         steps.filter(|nanos| *nanos < SCENARIO_GAP_NANOS).map(|nanos| nanos as f64 * 1e-9).sum()
     }
 
-    /// Bytes of all that was fused.
+    /// Bytes of all fused messages.
     #[must_use]
     pub fn communication(&self) -> Communication {
         Communication::of(&self.bytes, self.nominal_values)
     }
 
-    /// Every neighbour that was heard.
+    /// Every neighbour from which messages were received.
     #[must_use]
     pub fn neighbours(&self) -> &BTreeMap<CavId, NeighbourRecord> {
         &self.neighbours
@@ -177,7 +177,7 @@ impl FrameScores {
         self.judge_poses(&tick.poses, &world_from_lidar);
         let is_there = world_from_lidar.iter().any(|(cav, _)| *cav == self.ego);
         if tick.result.is_none() && !is_there && !world_from_lidar.is_empty() {
-            // The ego takes no part at this tick, so nothing is missed.
+            // The ego takes no part at this tick, so no result is missing.
             return;
         }
         let boxes = true_boxes(&truth, &self.ego, &self.rule);
@@ -193,8 +193,8 @@ impl FrameScores {
         self.judge_result((truth.tick, capture_nanos), stamps, result, boxes, world_from_lidar);
     }
 
-    /// Judges a frame whose truth is known already, at once; `poses` are everyone's estimates. Nothing that
-    /// [`Self::truth`], [`Self::result`] and [`Self::pose`] take may be given for it.
+    /// Scores a frame whose truth is known already, at once; `poses` are the estimates of all vehicles. The same frame
+    /// must not be given to [`Self::truth`], [`Self::result`] and [`Self::pose`].
     pub fn judge_whole(
         &mut self,
         (tick, capture_nanos): (u64, u64),
@@ -213,7 +213,7 @@ impl FrameScores {
         self.judge_result((tick, capture_nanos), stamps, result, boxes, world_from_lidar);
     }
 
-    /// Judges a tick by what was known when it began, answered or not.
+    /// Scores a tick against the truth at its publication, with or without a result.
     fn judge_live(
         &mut self,
         began_nanos: u64,
@@ -265,7 +265,7 @@ impl FrameScores {
         self.keep_showpiece(tick, result, boxes, world_from_lidar);
     }
 
-    /// Adds a frame to the score; returns how many detections count as found.
+    /// Adds a frame to the scores; returns the number of detections that count as found.
     fn score(&mut self, result: &Detections, boxes: &[Box3d]) -> usize {
         let tally = |scorer: &Scorer| {
             scorer.tallies().iter().find(|tally| tally.iou_threshold == FOUND_IOU).map_or(0, |tally| {
@@ -282,7 +282,7 @@ impl FrameScores {
             match (estimate.world_from_cav(), true_pose(truth, cav)) {
                 (Some(found), Some(truth)) => self.pose_errors.push(PoseError::between(found, truth)),
                 (None, Some(_)) => self.no_pose += 1,
-                // A vehicle that the scene does not know has no truth to compare with.
+                // A vehicle that is not in the scene has no truth.
                 (_, None) => {}
             }
         }

@@ -1,26 +1,26 @@
-//! What neighbours contributed to the frames of a run.
+//! Contribution of the neighbours to the frames of a run.
 
 use protocol::{Account, CavId, Ledger, Role, Stream, Topic};
 use serde::{Deserialize, Serialize};
 
-/// How much of what neighbours shared came to use.
+/// Use of the data that neighbours shared.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct Contribution {
     /// Neighbours whose data are in the result, mean over the frames.
     pub fused_per_frame: Option<f64>,
-    /// Maps, boxes or clouds that neighbours have sent; 0 where messages cross no air.
+    /// Number of feature maps, boxes or clouds that neighbours have sent; 0 without a network.
     pub sent: u64,
-    /// Those of them that arrived in time and were used.
+    /// Number of those that arrived in time and were used.
     pub used: u64,
-    /// Mean bytes of everything a neighbour sent for a frame, headers and pose message included, used or not.
+    /// Mean bytes of all messages that a neighbour sent for a frame, headers and pose message included, used or not.
     pub sent_bytes_mean: Option<f64>,
 }
 
 impl Contribution {
-    /// Sums up the books of a run of `ego`: in `frames` frames `fused` neighbours were fused. `sent_bytes` is the size of all
-    /// that was sent, where it is known.
-    pub(crate) fn of(frames: usize, fused: usize, ego: &CavId, books: &Ledger, sent_bytes: Option<u64>) -> Self {
-        let of_neighbours = || books.iter().filter(|(account, _)| shares(&account.topic, ego));
+    /// Summarises the ledger of a run of `ego`: in `frames` frames `fused` neighbours were fused. `sent_bytes` is the
+    /// size of all messages that were sent, if known.
+    pub(crate) fn of(frames: usize, fused: usize, ego: &CavId, ledger: &Ledger, sent_bytes: Option<u64>) -> Self {
+        let of_neighbours = || ledger.iter().filter(|(account, _)| shares(&account.topic, ego));
         let is_sent = |account: &Account| matches!(account.topic, Topic::Stream { .. });
         let sent = of_neighbours().filter(|(account, _)| is_sent(account)).map(|(_, counts)| counts.sent).sum();
         let ego_process = format!("{}-", Role::Ego);
@@ -35,7 +35,7 @@ impl Contribution {
     }
 }
 
-/// Whether a topic carries what another vehicle than `ego` sees.
+/// True if a topic carries perception data of another vehicle than `ego`.
 fn shares(topic: &Topic, ego: &CavId) -> bool {
     match topic {
         Topic::Stream { cav, stream } | Topic::Received { cav, stream, .. } => {
@@ -51,47 +51,48 @@ mod tests {
 
     use super::*;
 
-    fn books() -> (Ledger, CavId) {
+    fn ledger() -> (Ledger, CavId) {
         let (ego, to) = (CavId::new("1").unwrap(), ProcessId::new("ego-1").unwrap());
         let topic = |name: &str, stream| Topic::Stream { cav: CavId::new(name).unwrap(), stream };
-        let mut books = Ledger::default();
+        let mut ledger = Ledger::default();
         for name in ["1", "2", "3"] {
             for stream in [Stream::Pose, Stream::Bev] {
                 let towards = Account::towards(topic(name, stream), &to);
                 for tick in 0..4 {
-                    books.sent(&Account::published(topic(name, stream)));
+                    ledger.sent(&Account::published(topic(name, stream)));
                     match (tick, stream) {
-                        (0, _) | (_, Stream::Pose) => books.received(&towards),
-                        _ => books.dropped(&towards, DropReason::Stale),
+                        (0, _) | (_, Stream::Pose) => ledger.received(&towards),
+                        _ => ledger.dropped(&towards, DropReason::Stale),
                     }
                 }
             }
         }
-        (books, ego)
+        (ledger, ego)
     }
 
     #[test]
     fn maps_of_neighbours_are_counted_and_neither_poses_nor_the_egos_own() {
-        let (books, ego) = books();
-        let contribution = Contribution::of(4, 2, &ego, &books, Some(800));
+        let (ledger, ego) = ledger();
+        let contribution = Contribution::of(4, 2, &ego, &ledger, Some(800));
         assert_eq!((contribution.sent, contribution.used), (8, 2));
         assert_eq!((contribution.fused_per_frame, contribution.sent_bytes_mean), (Some(0.5), Some(100.0)));
     }
 
     #[test]
     fn what_a_live_link_passes_on_is_sent_once() {
-        let (mut books, ego) = books();
+        let (mut ledger, ego) = ledger();
         let cav = CavId::new("2").unwrap();
         let passed = Topic::Received { ego: ego.clone(), cav: cav.clone(), stream: Stream::Bev };
-        books.received(&Account::towards(Topic::Stream { cav, stream: Stream::Bev }, &ProcessId::new("link").unwrap()));
-        books.sent(&Account::published(passed.clone()));
-        books.received(&Account::towards(passed, &ProcessId::new("ego-1").unwrap()));
-        let contribution = Contribution::of(4, 2, &ego, &books, None);
+        ledger
+            .received(&Account::towards(Topic::Stream { cav, stream: Stream::Bev }, &ProcessId::new("link").unwrap()));
+        ledger.sent(&Account::published(passed.clone()));
+        ledger.received(&Account::towards(passed, &ProcessId::new("ego-1").unwrap()));
+        let contribution = Contribution::of(4, 2, &ego, &ledger, None);
         assert_eq!((contribution.sent, contribution.used), (8, 3));
     }
 
     #[test]
-    fn without_frames_and_air_nothing_is_known() {
+    fn without_frames_and_network_all_values_are_absent() {
         let nothing = Contribution::of(0, 0, &CavId::new("1").unwrap(), &Ledger::default(), Some(0));
         assert_eq!(nothing, Contribution::default());
     }

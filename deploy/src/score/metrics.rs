@@ -1,4 +1,4 @@
-//! `metrics.json`: what a run is judged by, and how each number comes about.
+//! `metrics.json`: metrics of a run and their definitions.
 
 mod answered;
 mod contribution;
@@ -12,51 +12,52 @@ use protocol::{CavId, Counts, DropReason, Ledger};
 use serde::{Deserialize, Serialize};
 use support::statistics::{quantile, sorted};
 
-use crate::experiment::score::{FrameScores, NeighbourRecord};
+use crate::score::{FrameScores, NeighbourRecord};
 
 pub use answered::Answered;
 pub use contribution::Contribution;
 
-/// A pose nearer to the truth than this is a success, metres.
+/// Pose error below which localization counts as a success, metres.
 const SUCCESS_M: f64 = 3.0;
 
-/// The numbers of one run.
+/// Metrics of one run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Metrics {
-    /// Frames the ego reported on.
+    /// Number of frames that the ego reported.
     pub frames: u64,
     /// From the first to the last detections, seconds of wall time.
     pub seconds: f64,
-    /// Which clock the run kept.
+    /// Clock of the run.
     pub clock: String,
     /// Fusion method.
     pub method: String,
-    /// Where poses came from.
+    /// Name of the pose source.
     pub pose_source: String,
     /// Average precision with detections ordered by score over all frames, by IoU threshold. The headline.
     pub ap_global: ByIou,
     /// Average precision with detections in frame order, by score only within a frame, as the reference code does.
     pub ap_frame_order: ByIou,
-    /// Average precision over all ticks, those without a report included; `null` where results have no time of publication.
+    /// Average precision over all ticks, those without a report included; `null` if results have no time of
+    /// publication.
     #[serde(default)]
     pub answered: Option<Answered>,
-    /// How far the poses that were fused with lie from the truth.
+    /// Errors of the poses that fusion used.
     pub pose: PoseErrors,
-    /// Delays.
+    /// Latencies.
     pub latency_ms: Latencies,
-    /// Age of what neighbours contributed: capture time of the ego's sweep less that of the neighbour's, per neighbour and
-    /// frame that was fused, milliseconds.
+    /// Age of neighbours' data: capture time of the ego's sweep less that of the neighbour's, per neighbour and frame
+    /// that was fused, milliseconds.
     #[serde(default)]
     pub age_ms: Percentiles,
-    /// What crossed the air.
+    /// Transmitted data.
     pub comm: Communication,
-    /// What neighbours contributed.
+    /// Contribution of the neighbours.
     #[serde(default)]
     pub contribution: Contribution,
-    /// Every neighbour that the ego heard.
+    /// Every neighbour from which the ego received messages.
     #[serde(default)]
     pub neighbours: BTreeMap<CavId, NeighbourRecord>,
-    /// The ledger's totals.
+    /// Totals of the ledger.
     pub messages: Messages,
     /// The evaluation protocol, with the ground-truth range as it was applied.
     #[serde(default)]
@@ -67,13 +68,14 @@ pub struct Metrics {
 }
 
 impl Metrics {
-    /// What a board has seen of a run of `seconds`; `sent_bytes` is the size of all that neighbours sent, where it is known.
+    /// Metrics from the scores of a run of `seconds`; `sent_bytes` is the size of all messages that neighbours sent, if
+    /// known.
     pub(crate) fn of(
         board: &FrameScores,
         clock: &str,
         [method, pose_source]: [&str; 2],
         seconds: f64,
-        books: &Ledger,
+        ledger: &Ledger,
         sent_bytes: Option<u64>,
     ) -> Self {
         let fused = board.records().iter().map(|record| record.fused).sum();
@@ -91,16 +93,16 @@ impl Metrics {
             latency_ms: board.latencies(),
             age_ms: board.ages(),
             comm: board.communication(),
-            contribution: Contribution::of(board.records().len(), fused, board.ego(), books, sent_bytes),
+            contribution: Contribution::of(board.records().len(), fused, board.ego(), ledger, sent_bytes),
             neighbours: board.neighbours().clone(),
-            messages: Messages::of(&books.total()),
+            messages: Messages::of(&ledger.total()),
             protocol: None,
             left_out: LeftOut::default(),
         }
     }
 }
 
-/// One number per IoU threshold; `null` where there was nothing to find.
+/// One value per IoU threshold; `null` without a true object.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct ByIou {
     /// At IoU 0.3.
@@ -131,10 +133,10 @@ pub struct PoseErrors {
     pub no_pose: u64,
 }
 
-/// Delays of a run.
+/// Latencies of a run.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct Latencies {
-    /// From the publication of a sweep to the publication of the detections that come of it, milliseconds.
+    /// From the publication of a sweep to the publication of the detections from it, milliseconds.
     pub capture_to_detection: Percentiles,
 }
 
@@ -149,12 +151,12 @@ pub struct Percentiles {
     pub p99: Option<f64>,
 }
 
-/// What crossed the air, per neighbour and frame that was fused.
+/// Transmitted data, per neighbour and frame that was fused.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct Communication {
-    /// Mean bytes of metadata and body of what was fused.
+    /// Mean bytes of metadata and body of the fused messages.
     pub payload_bytes_mean: Option<f64>,
-    /// Mean bytes of everything a neighbour sent for a frame, headers and pose message included.
+    /// Mean bytes of all messages that a neighbour sent for a frame, headers and pose message included.
     pub wire_bytes_mean: Option<f64>,
     /// Base-2 logarithm of `payload_bytes_mean`, as papers give communication volume.
     pub log2_payload: Option<f64>,
@@ -162,7 +164,7 @@ pub struct Communication {
     pub nominal_fp32_log2: f64,
 }
 
-/// So many messages may be under way at the end of any run.
+/// Number of messages that may be in flight at the end of any run.
 const FEW: u64 = 20;
 
 /// Messages of all processes.
@@ -170,9 +172,9 @@ const FEW: u64 = 20;
 pub struct Messages {
     /// Published, once per receiver.
     pub sent: u64,
-    /// Used.
+    /// Received and used.
     pub received: u64,
-    /// Still under way at the end.
+    /// In flight at the end.
     pub in_flight: u64,
     /// Not used, by reason.
     pub dropped: BTreeMap<DropReason, u64>,
@@ -188,14 +190,15 @@ impl Percentiles {
 }
 
 impl Messages {
-    /// The totals of a ledger.
+    /// Totals of a ledger.
     #[must_use]
     pub fn of(total: &Counts) -> Self {
         let Counts { sent, received, in_flight, dropped, adapted: _ } = total.clone();
         Self { sent, received, in_flight, dropped }
     }
 
-    /// Whether most of what was sent never arrived and was not lost either: then the link carries next to nothing.
+    /// True if most of the messages that were sent neither arrived nor were lost: then the link carries next to
+    /// nothing.
     #[must_use]
     pub fn are_stuck(&self) -> bool {
         self.in_flight >= FEW && self.in_flight > self.sent / 2
@@ -203,7 +206,7 @@ impl Messages {
 }
 
 impl PoseErrors {
-    /// Sums up the errors of all poses; `no_pose` vehicles had none.
+    /// Summarises the errors of all poses; `no_pose` is the number of frames of vehicles without a pose.
     #[must_use]
     pub fn of(errors: &[PoseError], no_pose: u64) -> Self {
         let distances = sorted(&errors.iter().map(|error| error.distance_m).collect::<Vec<_>>());
@@ -221,7 +224,7 @@ impl PoseErrors {
 }
 
 impl Communication {
-    /// Sums up `(payload, wire)` bytes of every neighbour and frame; `nominal_values` is the size of a feature map.
+    /// Summarises `(payload, wire)` bytes of every neighbour and frame; `nominal_values` is the size of a feature map.
     #[must_use]
     pub fn of(bytes: &[(u64, u64)], nominal_values: u64) -> Self {
         let payload = mean(bytes.iter().map(|(payload, _)| *payload as f64));

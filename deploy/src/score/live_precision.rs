@@ -1,4 +1,4 @@
-//! Average precision over all ticks of a live run: unanswered ones count, and so does the age of an answer.
+//! Average precision over all ticks of a live run: ticks without a result count, and so does the age of a result.
 
 use std::collections::VecDeque;
 
@@ -6,12 +6,12 @@ use perception::boxes::postprocess::is_within;
 use protocol::{Box3d, Detection, Pose};
 use training::average_precision::{Ordering, Scorer};
 
-use crate::experiment::metrics::{Answered, ByIou};
+use crate::score::metrics::{Answered, ByIou};
 
-/// Detections that are kept because they were published after the ticks judged so far: more than any run has under way.
+/// Largest number of detections that were published after the ticks scored so far: more than any run has in flight.
 const MOST_KEPT: usize = 64;
 
-/// The score over all ticks so far. Ticks come in the order of their capture times.
+/// Precision over all ticks so far. Ticks come in the order of their capture times.
 #[derive(Default)]
 pub(super) struct LivePrecision {
     answered: u64,
@@ -21,27 +21,27 @@ pub(super) struct LivePrecision {
     published: VecDeque<Published>,
 }
 
-/// Detections, when they were published and where the ego was at their capture.
+/// Detections, their time of publication and the ego's pose at their capture.
 struct Published {
     nanos: u64,
     world_from_ego: Option<Pose>,
     detections: Vec<Detection>,
 }
 
-/// What is there at a tick.
+/// Ground truth of a tick.
 pub(super) struct TickTruth<'a> {
-    /// When the tick was published, nanoseconds.
+    /// Time of publication of the tick, nanoseconds.
     pub(super) began_nanos: u64,
     /// True pose of the ego's LiDAR.
     pub(super) world_from_ego: Option<Pose>,
     /// True boxes in the ego's LiDAR frame.
     pub(super) boxes: &'a [Box3d],
-    /// The area that boxes are judged in: x, y of the lower, then of the upper corner, metres in that frame.
+    /// Area of the scored boxes: x, y of the lower, then of the upper corner, metres in that frame.
     pub(super) area_m: [f64; 4],
 }
 
 impl LivePrecision {
-    /// Adds a tick; `answer` are its detections and when they were published, nanoseconds, or none.
+    /// Adds a tick; `answer` holds its detections and their time of publication, nanoseconds, or `None`.
     pub(super) fn add(&mut self, truth: &TickTruth<'_>, answer: Option<(u64, &[Detection])>) {
         self.ticks += 1;
         self.answered += u64::from(answer.is_some());
@@ -57,12 +57,12 @@ impl LivePrecision {
         }
     }
 
-    /// Another scenario begins: what was published in the one before says nothing of it.
+    /// Another scenario begins: detections of the previous one do not apply to it.
     pub(super) fn forget(&mut self) {
         self.published.clear();
     }
 
-    /// The score; none where there were no ticks.
+    /// The precision; `None` without ticks.
     pub(super) fn answered(&self) -> Option<Answered> {
         (self.ticks > 0).then(|| Answered {
             answered: self.answered,
@@ -72,7 +72,8 @@ impl LivePrecision {
         })
     }
 
-    /// The detections of the newest sweep that were published by a tick, where the ego is then. What is older is forgotten.
+    /// The detections of the newest sweep that were published by a tick, moved to the ego's pose at that tick. Older
+    /// ones are dropped.
     fn newest(&mut self, truth: &TickTruth<'_>) -> Vec<Detection> {
         let Some(index) = self.published.iter().rposition(|published| published.nanos <= truth.began_nanos) else {
             return Vec::new();
@@ -91,7 +92,7 @@ impl LivePrecision {
     }
 }
 
-/// AP at the three overlaps; none where there was nothing to find.
+/// AP at the three IoU thresholds; `None` without a true object.
 pub(super) fn by_iou(scorer: &Scorer, ordering: Ordering) -> ByIou {
     let objects = scorer.tallies().first().map_or(0, |tally| tally.objects);
     match scorer.average_precisions(ordering)[..] {
@@ -110,8 +111,8 @@ mod tests {
         Box3d { center_m: [x, 0.0, -1.0], size_m: [4.0, 2.0, 1.5], heading_rad: 0.0 }
     }
 
-    /// The ego drives 1 m along x from tick to tick, ten a second, towards a car that stands at 20 m in the world; ticks in
-    /// `answered` have it found, so much later.
+    /// The ego drives 1 m along x from tick to tick, ten a second, towards a car that stands at 20 m in the world; the
+    /// ticks in `answered` have results that contain it, with the given latency.
     fn run(ticks: u64, answered: &[u64], latency_ms: u64, speed_m: f64) -> Answered {
         let mut live = LivePrecision::default();
         for tick in 0..ticks {
@@ -135,15 +136,15 @@ mod tests {
 
     #[test]
     fn the_last_answer_serves_until_the_next_and_the_egos_own_motion_does_not_spoil_it() {
-        // Nothing is published by the first tick; the answer to it serves the three that follow.
+        // Nothing is published by the first tick; its result serves the three that follow.
         assert_eq!(run(4, &[0], 50, 0.0).streaming_ap.at_70, Some(0.75));
-        // An answer that takes 250 ms serves from the third tick after its own on.
+        // A result that takes 250 ms serves from the third tick after its own on.
         assert_eq!(run(4, &[0, 1, 2, 3], 250, 0.0).streaming_ap.at_70, Some(0.25));
     }
 
     #[test]
     fn what_moves_is_no_longer_where_it_was_found() {
-        // 0.5 m a tick and answers that are one tick old: an overlap of 0.78. Two ticks old: 0.6.
+        // 0.5 m a tick and results that are one tick old: an overlap of 0.78. Two ticks old: 0.6.
         let is_near = |found: Option<f64>, expected: f64| (found.unwrap() - expected).abs() < 1e-9;
         assert!(is_near(run(5, &[0, 1, 2, 3, 4], 100, 0.5).streaming_ap.at_70, 0.8));
         let late = run(5, &[0, 1, 2, 3, 4], 200, 0.5).streaming_ap;
@@ -160,7 +161,7 @@ mod tests {
             let answer = (tick == 0).then_some((began_nanos, &found[..]));
             live.add(&TickTruth { began_nanos, world_from_ego, boxes, area_m: AREA_M }, answer);
         }
-        assert_eq!(live.streaming.tallies()[0].matched, [], "it lies behind the area at the second tick");
+        assert_eq!(live.streaming.tallies()[0].matched, [], "it is behind the area at the second tick");
         live.forget();
         assert_eq!((live.published.len(), live.ticks), (0, 2));
         assert!(LivePrecision::default().answered().is_none());

@@ -1,4 +1,4 @@
-//! What a person sees while a run goes: a live line on a terminal, plain lines elsewhere.
+//! Progress display of a run: a live line on a terminal, plain lines elsewhere.
 
 use std::io::IsTerminal;
 use std::time::{Duration, Instant};
@@ -7,12 +7,12 @@ use indicatif::ProgressBar;
 use support::output;
 use support::progress;
 
-use crate::experiment::score::Progress;
+use crate::score::Progress;
 
-/// Between two plain lines.
+/// Interval between two plain lines.
 const LINE_PERIOD: Duration = Duration::from_secs(2);
 
-/// Shows a run on standard error.
+/// Display of a run on standard error.
 pub struct Display {
     bar: Option<ProgressBar>,
     last_line: Instant,
@@ -29,7 +29,7 @@ impl Display {
         Self { bar, last_line: Instant::now(), shown_frames: 0 }
     }
 
-    /// Shows how it goes.
+    /// Updates the live line, or prints a plain line if one is due.
     pub fn update(&mut self, progress: &Progress) {
         match &self.bar {
             Some(bar) => {
@@ -45,7 +45,7 @@ impl Display {
         }
     }
 
-    /// Says something that happened, above the live line.
+    /// Prints an event above the live line.
     pub fn say(&self, text: &str) {
         match &self.bar {
             Some(bar) => bar.suspend(|| output::note(text)),
@@ -53,7 +53,7 @@ impl Display {
         }
     }
 
-    /// Takes the live line away.
+    /// Removes the live line.
     pub fn finish(self) {
         if let Some(bar) = self.bar {
             bar.finish_and_clear();
@@ -73,7 +73,7 @@ fn summary(progress: &Progress) -> String {
     )
 }
 
-/// A number of bytes for people.
+/// A number of bytes as text, with a unit.
 #[must_use]
 pub fn bytes(count: f64) -> String {
     const UNITS: [&str; 4] = ["B", "kB", "MB", "GB"];
@@ -98,7 +98,7 @@ mod tests {
     }
 
     #[test]
-    fn the_line_says_rate_latency_bytes_and_drops() {
+    fn the_line_has_rate_latency_bytes_and_drops() {
         let now = Instant::now();
         let progress = Progress {
             frames: 11,

@@ -1,33 +1,34 @@
-//! What became of each neighbour over a run.
+//! Record of each neighbour over a run.
 
 use std::collections::BTreeMap;
 
 use protocol::{CavId, Detections, DropReason, MisbehaviourReason};
 use serde::{Deserialize, Serialize};
 
-/// Neighbours that are told apart: no scene has more.
+/// Largest number of neighbours with a record: no scene has more.
 const MAX_NEIGHBOURS: usize = 256;
 
-/// A neighbour over all frames of a run.
+/// Record of a neighbour over all frames of a run.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct NeighbourRecord {
-    /// Frames that its data are in.
+    /// Number of frames that its data were fused in.
     pub fused: u64,
-    /// Frames that they are not in, by reason; those for which nothing came are not counted.
+    /// Number of frames without its data, by reason; frames without a message of it are not counted.
     pub left_out: BTreeMap<DropReason, u64>,
-    /// Frames that it was left out of because it was not believed, by what spoke against it.
+    /// Number of frames that it was excluded from by misbehaviour detection, by reason.
     pub doubts: BTreeMap<MisbehaviourReason, u64>,
-    /// How likely the ego thought it honest at last, 0..=1; none where the ego does not ask.
+    /// Trust score of the neighbour at the end, 0..=1; `None` without misbehaviour detection.
     pub trust: Option<f64>,
-    /// The least that it ever was.
+    /// Lowest trust score.
     pub least_trust: Option<f64>,
-    /// Its clock less the ego's, less the shortest time a message was under way, at last, seconds; none in virtual time.
+    /// Offset of its clock from the ego's, less the shortest transmission time, at the end, seconds; `None` in
+    /// simulation time.
     pub clock_offset_s: Option<f64>,
-    /// Why it was not believed at last, if it was not.
+    /// Misbehaviour reason at the end, if it was excluded.
     pub doubt: Option<MisbehaviourReason>,
 }
 
-/// Adds what a result says of the neighbours.
+/// Adds the neighbours of a result.
 pub(super) fn add(neighbours: &mut BTreeMap<CavId, NeighbourRecord>, result: &Detections) {
     let mut change = |cav: &CavId, change: &dyn Fn(&mut NeighbourRecord)| {
         if neighbours.len() < MAX_NEIGHBOURS || neighbours.contains_key(cav) {
@@ -48,7 +49,7 @@ pub(super) fn add(neighbours: &mut BTreeMap<CavId, NeighbourRecord>, result: &De
                 *record.doubts.entry(doubt).or_default() += 1;
             }
             record.doubt = heard.doubt;
-            // Of one that cannot be fused the ego makes up no mind.
+            // One that cannot be fused gets no new trust score.
             record.trust = heard.trust.or(record.trust);
             record.least_trust = [record.least_trust, heard.trust].into_iter().flatten().reduce(f64::min);
             record.clock_offset_s = heard.clock_offset_s.or(record.clock_offset_s);

@@ -1,4 +1,4 @@
-//! `detections.jsonl`: a line per result, as they come.
+//! `detections.jsonl`: a line per result, appended during the run.
 
 use std::fs::File;
 use std::io::{self, BufWriter, Write};
@@ -6,13 +6,13 @@ use std::path::Path;
 
 use protocol::DetectionsReport;
 
-/// What waits for a disk that is full: some hundred results.
+/// Size of the buffer that waits for a full disk, bytes: some hundred results.
 const WAITING: usize = 1 << 20;
 
-/// The file. A disk that is full ends no run: what finds no room any more is counted.
+/// The file. A full disk ends no run: results without room are counted.
 pub(super) struct ResultLines<W: Write = File> {
     out: BufWriter<W>,
-    /// Lines since everything was last on the disk.
+    /// Lines since the last complete flush.
     waiting: u64,
     lost: u64,
     has_complained: bool,
@@ -29,10 +29,10 @@ impl<W: Write> ResultLines<W> {
         Self { out: BufWriter::with_capacity(WAITING, out), waiting: 0, lost: 0, has_complained: false }
     }
 
-    /// Adds a line; someone may be following the file.
+    /// Adds a line; another process may be reading the file.
     pub(super) fn add(&mut self, report: &DetectionsReport) {
         let line = report.to_json() + "\n";
-        // Whole or not at all: what does not fit beside what waits is not begun.
+        // All or nothing: a line that does not fit into the buffer is not begun.
         let has_room = self.out.buffer().len() + line.len() <= WAITING || self.out.flush().is_ok();
         match has_room.then(|| self.out.write_all(line.as_bytes())) {
             Some(Ok(())) => self.waiting += 1,
@@ -48,10 +48,10 @@ impl<W: Write> ResultLines<W> {
         }
     }
 
-    /// How many results are not in the file.
+    /// Number of results that are not in the file.
     pub(super) fn finish(mut self) -> u64 {
         let is_written = self.out.flush().is_ok();
-        // What is left in the buffer is not tried once more.
+        // The rest of the buffer is not tried once more.
         let _ = self.out.into_parts();
         self.lost + if is_written { 0 } else { self.waiting }
     }
@@ -65,7 +65,7 @@ mod tests {
 
     use super::*;
 
-    /// A disk with room for so many bytes, and what is on it.
+    /// A disk with room for so many bytes, and its content.
     #[derive(Clone, Default)]
     struct Disk(Arc<Mutex<(usize, Vec<u8>)>>);
 

@@ -7,72 +7,71 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use bus::shutdown::Stop;
-use bus::{BusError, Endpoint, Rejection};
-use ego_fuser_offline::evaluation::EvaluateError;
-use protocol::{Ledger, ProcessId, Reconciliation, RunId};
+use bus::{Endpoint, Rejection};
+use protocol::{Ledger, Reconciliation, RunId};
 
-use crate::experiment::fingerprint::Provenance;
-use crate::experiment::ledger_report::LedgerReport;
-use crate::experiment::metrics::Metrics;
-use crate::experiment::progress::Display;
-use crate::experiment::score::{FrameScores, Progress, Scored, ScorerError, ScorerNode};
-use crate::operate::fleet::{Fleet, FleetError, RECORDER, REPLAY, SessionContext};
-use crate::operate::keys::KeyError;
+use crate::operate::RunError;
+use crate::operate::fleet::{Fleet, RECORDER, REPLAY, SessionContext};
 use crate::operate::network::RouterEndpoint;
-use crate::operate::offline_intervals;
+use crate::operate::progress::Display;
 use crate::operate::run_folder::{RunFolder, RunFolderError, SWEEP_LOG, name_of_now};
 use crate::operate::security::RefusalWatch;
 use crate::operate::status::Phase;
 use crate::operate::status_reporter::{Ending, StatusReporter};
-use crate::operate::supervise::{ProcessSpec, SuperviseError, Supervisor};
+use crate::operate::supervise::{ProcessSpec, Supervisor};
+use crate::run::ledger_report::LedgerReport;
+use crate::scenario::fingerprint::Provenance;
 use crate::scenario::{Clock, Scenario};
+use crate::score::metrics::Metrics;
+use crate::score::offline_intervals;
+use crate::score::{FrameScores, Progress, Scored, ScorerNode};
 
-/// How often the display is brought up to date.
+/// Update interval of the display.
 const BEAT: Duration = Duration::from_millis(100);
-/// Of the time for ending: until the replay must be gone.
+/// Fraction of the time for ending after which the replay must have ended.
 const REPLAY_SHARE: f64 = 0.25;
-/// Of the time for ending: until the last results must have come.
+/// Fraction of the time for ending after which the last results must have arrived.
 const DRAIN_SHARE: f64 = 0.5;
 
 /// For writing the index of a recording, after all others have ended.
 const RECORDER_SHARE: Duration = Duration::from_millis(800);
 
-/// What a run needs beside its scenario.
+/// Settings of a run beside its scenario.
 #[derive(Debug, Clone)]
 pub struct UpOptions {
     /// Folder of the run folders.
     pub runs: PathBuf,
     /// Folder of the programs `agent`, `ego-fuser` and `sim-replay`.
     pub programs: PathBuf,
-    /// First part of the name of a run that has none.
+    /// First part of the name of an unnamed run.
     pub prefix: &'static str,
 }
 
-/// What a run has come to.
+/// Result of a run.
 #[derive(Debug)]
 pub struct RunResult {
-    /// Where everything is.
+    /// Folder of the run.
     pub folder: RunFolder,
-    /// The numbers.
+    /// Metrics of the run.
     pub metrics: Metrics,
-    /// Whether every message is accounted for.
+    /// Message accounting: the discrepancies between senders and receivers.
     pub balance: Reconciliation,
-    /// Ticks of which the ego never told anything.
+    /// Number of ticks for which the ego published nothing.
     pub missed: u64,
-    /// Someone ended it before it was over.
+    /// True if the run was interrupted before its end.
     pub interrupted: bool,
     /// Processes that did not end in time and were killed.
     pub killed: Vec<String>,
-    /// What could not be written of the run, in words: the disk is full, perhaps.
+    /// Files of the run that could not be written, with the reason (for example a full disk).
     pub unwritten: Vec<String>,
-    /// Processes that failed in what they were to do, in words.
+    /// Processes that failed in their task, with the reason.
     pub failures: Vec<String>,
-    /// The picture of one fused frame, where there was one to draw.
+    /// Picture of one fused frame, if one could be drawn.
     pub picture: Option<PathBuf>,
 }
 
 impl RunResult {
-    /// Whether data were lost beyond what the link dropped.
+    /// True if data were lost beyond the drops of the link.
     #[must_use]
     pub fn lost_data(&self) -> bool {
         let dropped = self.metrics.messages.dropped.iter().any(|(reason, count)| reason.is_loss() && *count > 0);
@@ -86,109 +85,35 @@ impl RunResult {
     }
 }
 
-/// Why a run came to nothing.
-#[derive(Debug, thiserror::Error)]
-pub enum UpError {
-    /// The scenario makes no fleet.
-    #[error(transparent)]
-    Fleet(#[from] FleetError),
-    /// The run folder cannot be used.
-    #[error(transparent)]
-    Folder(#[from] RunFolderError),
-    /// The processes cannot meet.
-    #[error(transparent)]
-    Network(#[from] BusError),
-    /// Another fleet of that name is there; both would fall silent.
-    #[error(
-        "run {run} is already live on {router}: {}; choose another --name, or end it first",
-        processes.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ")
-    )]
-    Live {
-        /// Its name.
-        run: RunId,
-        /// Where.
-        router: String,
-        /// Which of the processes that would be started are there.
-        processes: Vec<ProcessId>,
-    },
-    /// There are no keys for the processes.
-    #[error("security: {0}")]
-    Keys(#[from] KeyError),
-    /// The scorer cannot work.
-    #[error("scorer: {0}")]
-    Scorer(#[from] ScorerError),
-    /// The processes cannot be started.
-    #[error(transparent)]
-    Supervise(#[from] SuperviseError),
-    /// Signals cannot be caught.
-    #[error("cannot catch Ctrl-C: {0}")]
-    Signals(std::io::Error),
-    /// A run in virtual time cannot be computed.
-    #[error(transparent)]
-    Evaluate(Box<EvaluateError>),
-    /// A process stays down.
-    #[error("{process} {how} (log: {})", log.display())]
-    Process {
-        /// Which.
-        process: String,
-        /// How it ended.
-        how: String,
-        /// Its log.
-        log: PathBuf,
-    },
-}
-
-impl UpError {
-    /// Whether the input is at fault, and not the run.
-    #[must_use]
-    pub fn is_bad_input(&self) -> bool {
-        match self {
-            Self::Network(error) => error.is_bad_input(),
-            Self::Fleet(_) | Self::Folder(RunFolderError::Pop(_)) | Self::Live { .. } => true,
-            Self::Evaluate(error) => matches!(**error, EvaluateError::TooSlow { .. } | EvaluateError::Link(_)),
-            _ => false,
-        }
-    }
-
-    /// Whether the run was refused before anything of it began, so that nothing in its folder is of use.
-    pub(crate) fn is_refusal(&self) -> bool {
-        match self {
-            Self::Process { .. } | Self::Folder(_) => false,
-            Self::Evaluate(_) => self.is_bad_input(),
-            _ => true,
-        }
-    }
-}
-
-/// RunScope a scenario to its end, or until Ctrl-C.
+/// Runs a scenario to its end, or until Ctrl-C.
 ///
 /// # Errors
-/// [`UpError`] when the run cannot start, or a process stays down.
-pub fn up(scenario: &Scenario, options: &UpOptions) -> Result<RunResult, UpError> {
+/// [`RunError`] when the run cannot start, or a process stays down.
+pub fn up(scenario: &Scenario, options: &UpOptions) -> Result<RunResult, RunError> {
     if scenario.clock == Clock::Stepped {
-        return crate::experiment::stepped::up(scenario, options);
+        return crate::run::stepped::up(scenario, options);
     }
     let fleet = Fleet::plan(scenario)?;
     let run = fleet.scenario.run.clone().unwrap_or_else(|| name_of_now(options.prefix));
     let folder = RunFolder::create(&options.runs, &run)?;
     let result = go(&fleet, options, &run, &folder);
-    if result.as_ref().is_err_and(UpError::is_refusal) {
+    if result.as_ref().is_err_and(RunError::is_refusal) {
         folder.remove();
     }
     result
 }
 
-/// RunScope a fleet, as the run of that name in that folder.
-fn go(fleet: &Fleet, options: &UpOptions, run: &RunId, folder: &RunFolder) -> Result<RunResult, UpError> {
+/// Runs a fleet under the given run name in the given folder.
+fn go(fleet: &Fleet, options: &UpOptions, run: &RunId, folder: &RunFolder) -> Result<RunResult, RunError> {
     let stop = Stop::new();
-    stop.on_signals().map_err(UpError::Signals)?;
+    stop.on_signals().map_err(RunError::Signals)?;
     let fingerprint = fingerprint(fleet, &options.programs);
 
     let keys = fleet.keys(folder)?;
     let place = RouterEndpoint::open(&fleet.scenario.network, run, keys.as_ref())?;
     let (endpoint, programs) = (&place.endpoint, options.programs.as_path());
-    let meeting = SessionContext { run, endpoint, keys: keys.as_ref(), programs, folder };
-    let specs = fleet.processes(&meeting)?;
+    let context = SessionContext { run, endpoint, keys: keys.as_ref(), programs, folder };
+    let specs = fleet.processes(&context)?;
     place.check_free(&fleet.scenario.network, run, &specs)?;
     let refused = RefusalWatch::over(&place)?;
     let board = FrameScores::new(fleet.ego.clone(), fleet.ground_truth_rule(), fleet.map_values());
@@ -197,7 +122,7 @@ fn go(fleet: &Fleet, options: &UpOptions, run: &RunId, folder: &RunFolder) -> Re
     if let Some(address) = fleet.scenario.network.metrics {
         scorer.serve_metrics(address)?;
     }
-    let watched = watch(fleet, &meeting, specs, &place.endpoint, &scorer, &stop);
+    let watched = watch(fleet, &context, specs, &place.endpoint, &scorer, &stop);
     // Before the scorer closes the session.
     let refused = refused.finish();
     let scored = scorer.finish();
@@ -211,27 +136,27 @@ fn go(fleet: &Fleet, options: &UpOptions, run: &RunId, folder: &RunFolder) -> Re
         Ending::Over | Ending::Asked => Ok(result),
         Ending::Failed { process, how } => {
             let log = result.folder.log_dir().join(format!("{process}.log"));
-            Err(UpError::Process { process, how, log })
+            Err(RunError::Process { process, how, log })
         }
     }
 }
 
-/// What a run was like for those who watched.
+/// Observations of the supervisor during a run.
 struct Watched {
     ending: Ending,
-    /// Who had to be killed at the end.
+    /// Processes that had to be killed at the end.
     killed: Vec<String>,
-    /// Who was away for a while.
-    away: BTreeSet<String>,
-    /// Who failed in what they were to do, in words.
+    /// Processes that were offline for some time.
+    offline: BTreeSet<String>,
+    /// Processes that failed in their task, with the reason.
     failures: Vec<String>,
 }
 
-/// When each sweep came to the ego's agent. One on another host notes nothing here.
+/// Arrival time of each sweep at the ego's agent, by capture time. An agent on another host writes none.
 fn swept(log: &Path) -> BTreeMap<u64, u64> {
     agent::sweep_log::read(log).unwrap_or_else(|error| {
         if error.kind() != std::io::ErrorKind::NotFound {
-            tracing::warn!("{}: {error}; frames.csv does not say when sweeps came", log.display());
+            tracing::warn!("{}: {error}; frames.csv lacks the arrival times of the sweeps", log.display());
         }
         BTreeMap::new()
     })
@@ -240,13 +165,13 @@ fn swept(log: &Path) -> BTreeMap<u64, u64> {
 /// Starts the processes, follows the run to its end, and ends the processes.
 fn watch(
     fleet: &Fleet,
-    meeting: &SessionContext<'_>,
+    context: &SessionContext<'_>,
     specs: Vec<ProcessSpec>,
     endpoint: &Endpoint,
     scorer: &ScorerNode,
     stop: &Stop,
-) -> Result<Watched, UpError> {
-    let SessionContext { run, folder, .. } = *meeting;
+) -> Result<Watched, RunError> {
+    let SessionContext { run, folder, .. } = *context;
     let (events, happened) = channel();
     let mut display = Display::new(fleet.ticks);
     for ProcessSpec { name, metrics, .. } in &specs {
@@ -259,14 +184,14 @@ fn watch(
     let mut supervisor = Supervisor::start(specs, &folder.log_dir(), restarts, &events)?;
     let mut watch = StatusReporter::new(fleet, run, endpoint, folder);
     let ending = watch.follow(&supervisor, &happened, scorer, stop, &mut display);
-    let mut away = scorer.absent();
-    away.extend(watch.fallen());
+    let mut offline = scorer.absent();
+    offline.extend(watch.fallen());
     watch.tell(Phase::Ending, &scorer.progress());
     let limits = Limits::of(fleet, &ending);
     let mut killed = supervisor.end(|name| name == REPLAY, limits.replay).killed;
     drain(&supervisor, scorer, limits.drain, &mut display);
     killed.extend(supervisor.end(|name| name.starts_with("agent"), limits.all).killed);
-    // The recorder hears everyone's last words.
+    // The recorder captures the last messages of all others.
     killed.extend(supervisor.end(|name| name != RECORDER, limits.all).killed);
     killed.extend(supervisor.end(|_| true, limits.all + RECORDER_SHARE).killed);
     display.finish();
@@ -274,12 +199,12 @@ fn watch(
         watch.note(&event);
     }
     watch.tell(Phase::Over, &scorer.progress());
-    away.extend(killed.iter().cloned());
+    offline.extend(killed.iter().cloned());
     let failures = watch.failures();
-    Ok(Watched { ending, killed, away, failures })
+    Ok(Watched { ending, killed, offline, failures })
 }
 
-/// Moments until which each step of the end has time.
+/// Deadlines of the steps of the end.
 struct Limits {
     replay: Instant,
     drain: Instant,
@@ -306,12 +231,12 @@ impl Limits {
     }
 }
 
-/// Waits until the ego has told of every tick there was, or the time is over.
+/// Waits until the ego has reported every tick, or the time is over.
 fn drain(supervisor: &Supervisor, scorer: &ScorerNode, until: Instant, display: &mut Display) {
     while !supervisor.all_ended() && Instant::now() < until {
         let progress = scorer.progress();
         display.update(&progress);
-        // The number of ticks is known for certain only after the replay's last word on them.
+        // The number of ticks is final only after the replay's last report.
         if progress.ended && progress.frames >= progress.ticks {
             return;
         }
@@ -319,7 +244,7 @@ fn drain(supervisor: &Supervisor, scorer: &ScorerNode, until: Instant, display: 
     }
 }
 
-/// Hashes what the run is made of while the run goes.
+/// Hashes programs, weights and scene during the run.
 fn fingerprint(fleet: &Fleet, programs: &Path) -> JoinHandle<std::io::Result<Provenance>> {
     let (programs, weights) = (Fleet::programs(programs), fleet.scenario.models.weights.clone());
     let scene = fleet.scene_dir.clone();
@@ -327,7 +252,7 @@ fn fingerprint(fleet: &Fleet, programs: &Path) -> JoinHandle<std::io::Result<Pro
     std::thread::spawn(move || Provenance::collect(&programs, &weights, &poses, &scene))
 }
 
-/// Writes the run folder; what cannot be written is told with the result, which is not lost with it.
+/// Writes the run folder; files that cannot be written are listed in the result, which is not lost with them.
 fn write(
     fleet: &Fleet,
     run: &RunId,
@@ -350,12 +275,12 @@ fn write(
     for process in &books {
         sum.merge(&process.ledger);
     }
-    let exempted = sum.exempt(|account| offline_intervals::concerns(&watched.away, account));
+    let exempted = sum.exempt(|account| offline_intervals::concerns(&watched.offline, account));
     let balance = sum.balance();
     let metrics = metrics(fleet, &board, &progress, &sum);
     note(folder.write_json("metrics.json", &metrics));
     note(folder.write_frames(board.records(), &swept(&folder.file(SWEEP_LOG))));
-    let report = LedgerReport::new(&books, &sum, &balance, (&watched.away, exempted)).with_refused(refused);
+    let report = LedgerReport::new(&books, &sum, &balance, (&watched.offline, exempted)).with_refused(refused);
     note(folder.write_json("ledger.json", &report));
     let provenance = match fingerprint.join() {
         Ok(Ok(provenance)) => Some(provenance),
@@ -367,19 +292,19 @@ fn write(
     };
     let resolved = Scenario { run: Some(run.clone()), provenance, ..fleet.scenario.clone() };
     note(folder.write("scenario.yaml", &resolved.to_yaml()));
-    let picture = crate::view::demo::draw(fleet, &board, &folder.file("frame.png"));
+    let picture = crate::run::demo::draw(fleet, &board, &folder.file("frame.png"));
     let interrupted = matches!(watched.ending, Ending::Asked);
     let (killed, failures) = (watched.killed.clone(), watched.failures.clone());
     let missed = missed(fleet, &board, &watched.ending);
     RunResult { folder, metrics, balance, missed, interrupted, killed, unwritten, failures, picture }
 }
 
-/// Ticks without a result. Those that nobody told of at all, as the replay fell with them on its way, are known by their
-/// number alone, once the scene is over.
+/// Ticks without a result. Those that no process reported, as the replay crashed with them in transit, are known by
+/// their number only, once the scene is over.
 fn missed(fleet: &Fleet, board: &FrameScores, ending: &Ending) -> u64 {
-    let told = board.records().len() as u64 + board.missed();
+    let reported = board.records().len() as u64 + board.missed();
     let played = fleet.ticks.filter(|_| matches!(ending, Ending::Over)).unwrap_or(0) as u64;
-    board.missed() + played.saturating_sub(told)
+    board.missed() + played.saturating_sub(reported)
 }
 
 fn metrics(fleet: &Fleet, board: &FrameScores, progress: &Progress, sum: &Ledger) -> Metrics {

@@ -1,4 +1,4 @@
-//! `ledger.json`: every process's books, their sum, and whether it balances.
+//! `ledger.json`: the ledger of every process, their sum, and the discrepancies.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -6,67 +6,68 @@ use bus::Rejection;
 use protocol::{Counts, Ledger, Reconciliation, StageSummary};
 use serde::Serialize;
 
-use crate::experiment::score::ProcessBooks;
+use crate::score::ProcessBooks;
 
-/// The books of a run.
+/// Message accounting of a run.
 #[derive(Debug, Clone, Serialize)]
 pub struct LedgerReport {
-    /// Whether every message that was sent is received, dropped for a reason, or in flight.
+    /// True if every message that was sent is received, dropped for a reason, or in flight.
     pub balances: bool,
-    /// What does not add up, and topics that nobody listened to.
+    /// Discrepancies, and topics without subscribers.
     pub balance: Reconciliation,
-    /// Processes that were away for a while.
+    /// Processes that were offline for some time.
     pub away: BTreeSet<String>,
-    /// Messages of which nobody can tell what became of them, because one of those was away.
+    /// Number of messages that are exempt from reconciliation, because one of those was offline.
     pub exempted: u64,
-    /// Everything added up.
+    /// Sum over all accounts.
     pub total: Counts,
-    /// All processes together, by topic and receiver.
+    /// Sum over all processes, by topic and receiver.
     pub sum: Ledger,
-    /// What the router of the run did not let through: by whom, what, why.
+    /// Requests that the router of the run refused: peer, message, reason.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub refused: Vec<RefusedReport>,
-    /// The last word of each process; one that was started again is there once for each life.
+    /// Last report of each process; a restarted one has an entry per instance.
     pub processes: Vec<ProcessReport>,
 }
 
-/// What the router did not let one peer say.
+/// Requests of one peer that the router refused.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct RefusedReport {
-    /// Whose certificate it showed.
+    /// Common name of its certificate.
     pub peer: String,
     /// `put`, `declare`, `query`.
     pub message: String,
     /// `access-control` or `low-pass`.
     pub reason: String,
-    /// How often.
+    /// Number of refusals.
     pub count: u64,
 }
 
-/// The books of one life of a process.
+/// Ledger of one process instance.
 #[derive(Debug, Clone, Serialize)]
 pub struct ProcessReport {
-    /// Its name.
+    /// Name of the process.
     pub process: String,
-    /// Its messages.
+    /// Its message counters.
     pub ledger: Ledger,
-    /// How long its stages took.
+    /// Durations of its stages.
     pub stages: Vec<StageSummary>,
 }
 
 impl LedgerReport {
-    /// The report on `books`, whose sum is `sum`; who was away, and what is exempted by that.
+    /// Report on `ledgers`, whose sum is `sum`; processes that were offline, and the number of messages exempt for
+    /// that.
     #[must_use]
     pub fn new(
-        books: &[ProcessBooks],
+        ledgers: &[ProcessBooks],
         sum: &Ledger,
         balance: &Reconciliation,
         (away, exempted): (&BTreeSet<String>, u64),
     ) -> Self {
-        let process = |books: &ProcessBooks| ProcessReport {
-            process: books.process.to_string(),
-            ledger: books.ledger.clone(),
-            stages: books.stages.clone(),
+        let process = |instance: &ProcessBooks| ProcessReport {
+            process: instance.process.to_string(),
+            ledger: instance.ledger.clone(),
+            stages: instance.stages.clone(),
         };
         Self {
             balances: balance.is_exact(),
@@ -76,11 +77,11 @@ impl LedgerReport {
             total: sum.total(),
             sum: sum.clone(),
             refused: Vec::new(),
-            processes: books.iter().map(process).collect(),
+            processes: ledgers.iter().map(process).collect(),
         }
     }
 
-    /// The same with what the router of the run refused.
+    /// Adds the requests that the router of the run refused.
     #[must_use]
     pub fn with_refused(self, refused: &BTreeMap<Rejection, u64>) -> Self {
         let refused = refused.iter().map(|(Rejection { peer, message, reason }, count)| RefusedReport {

@@ -1,4 +1,4 @@
-//! Which weights a method runs with.
+//! Choice of the weights of a method.
 
 use std::path::{Path, PathBuf};
 
@@ -6,18 +6,18 @@ use fusion::Method;
 use fusion::model::METHOD_KEY;
 use perception::weights::{Weights, WeightsError};
 
-/// What a training calls its weights.
+/// File name of the weights of a training.
 const TRAINED_FILE: &str = "weights.safetensors";
 
-/// Why a method has no weights.
+/// Reason why a method has no weights.
 #[derive(Debug, thiserror::Error)]
 pub enum WeightsChoiceError {
     /// The folder cannot be listed.
     #[error("{}: {source}", folder.display())]
     Io {
-        /// The folder.
+        /// Path of the folder.
         folder: PathBuf,
-        /// What the system said.
+        /// Error of the operating system.
         source: std::io::Error,
     },
     /// The folder has none, or several.
@@ -26,25 +26,25 @@ pub enum WeightsChoiceError {
         folder.display()
     )]
     NotOne {
-        /// The folder.
+        /// Path of the folder.
         folder: PathBuf,
-        /// The method.
+        /// Requested method.
         method: Method,
-        /// The method it would be trained for.
+        /// Method that such weights are trained for.
         name: &'static str,
-        /// How many there are.
+        /// Number of matching files.
         found: usize,
     },
     /// The folder is one of a training of another method.
     #[error("{}: trained for {trained}, and method {method} needs weights trained for {name}", file.display())]
     OtherMethod {
-        /// The weights.
+        /// Path of the weights.
         file: PathBuf,
-        /// The method.
+        /// Requested method.
         method: Method,
-        /// The method it would be trained for.
+        /// Method that such weights are trained for.
         name: &'static str,
-        /// The method that the file names.
+        /// Method that the file names.
         trained: String,
     },
     /// The weights of a training cannot be read.
@@ -53,10 +53,10 @@ pub enum WeightsChoiceError {
 }
 
 /// The weights of a method: `path` itself; of the folder `path` the one file `*-METHOD.safetensors` or
-/// `METHOD/weights.safetensors`, or where it has neither, `weights.safetensors` of a training of that method.
+/// `METHOD/weights.safetensors`, or if it has neither, `weights.safetensors` of a training of that method.
 ///
-/// `late` exchanges what every vehicle finds alone, so it runs with the weights of `none`; so does `early` where the
-/// folder has none of its own.
+/// `late` exchanges the ego-only detections of every vehicle, so it runs with the weights of `none`; so does `early` if
+/// the folder has none of its own.
 ///
 /// # Errors
 /// [`WeightsChoiceError`] when the folder does not hold exactly one.
@@ -85,7 +85,7 @@ pub fn weights_of(path: &Path, method: Method) -> Result<PathBuf, WeightsChoiceE
     Err(WeightsChoiceError::NotOne { folder: path.to_path_buf(), method, name, found })
 }
 
-/// The weights of a training, if it was one of a method that `method` can run with.
+/// The weights of a training of a method that `method` can run with.
 fn trained_for(file: PathBuf, method: Method, candidates: &[&'static str]) -> Result<PathBuf, WeightsChoiceError> {
     let weights = Weights::load(&file)?;
     match weights.metadata(METHOD_KEY) {
@@ -139,7 +139,7 @@ mod tests {
         assert_eq!(weights_of(Path::new("w.safetensors"), Method::LATE).unwrap(), Path::new("w.safetensors"));
     }
 
-    /// A training's folder with weights that say what they were trained for.
+    /// A training's folder with weights that name their method.
     fn write_trained(folder: &Path, method: Method) {
         std::fs::create_dir_all(folder).unwrap();
         let variables = VarStore::new(Device::Cpu);

@@ -1,22 +1,22 @@
-//! Results with the tick of the scene, which the truth of the same capture time tells.
+//! Results with the tick of the scene, from the truth of the same capture time.
 
 use std::collections::{BTreeMap, VecDeque};
 
 use protocol::DetectionsReport;
 
-/// Results that may wait for their truth, and ticks that are remembered.
+/// Largest number of results that wait for their truth, and of ticks that are remembered.
 const PLACES: usize = 256;
 
-/// Results on their way to the file. They keep their order, and wait only while their truth may still come.
+/// Results that wait to be written. They keep their order, and wait only while their truth may still arrive.
 #[derive(Default)]
 pub(super) struct NumberedResults {
-    /// By capture time.
+    /// Tick by capture time.
     ticks: BTreeMap<u64, u64>,
     waiting: VecDeque<DetectionsReport>,
 }
 
 impl NumberedResults {
-    /// Takes note of the tick at a capture time.
+    /// Records the tick of a capture time.
     pub(super) fn tick(&mut self, capture_nanos: u64, tick: u64) {
         self.ticks.insert(capture_nanos, tick);
         if self.ticks.len() > PLACES {
@@ -24,12 +24,13 @@ impl NumberedResults {
         }
     }
 
-    /// Adds a result behind those that wait.
+    /// Appends a result.
     pub(super) fn result(&mut self, report: DetectionsReport) {
         self.waiting.push_back(report);
     }
 
-    /// The next result whose tick is known, or will not be: a later truth has come, too many wait, or it `is_over`.
+    /// The next result whose tick is known, or will not be: a later truth has arrived, too many wait, or the run
+    /// `is_over`.
     pub(super) fn next(&mut self, is_over: bool) -> Option<DetectionsReport> {
         let capture_nanos = self.waiting.front()?.capture_nanos;
         let tick = self.ticks.get(&capture_nanos).copied();
@@ -75,7 +76,7 @@ mod tests {
     }
 
     #[test]
-    fn a_truth_that_is_lost_holds_nobody_up() {
+    fn a_lost_truth_delays_no_other_result() {
         let mut results = NumberedResults::default();
         results.result(report(100));
         results.result(report(200));

@@ -1,33 +1,33 @@
-//! Ticks of which something has come but not everything: truth, result and poses come in any order.
+//! Ticks with some but not all messages: truth, result and poses arrive in any order.
 
 use std::collections::BTreeMap;
 
 use protocol::{CavId, Detections, PoseEstimate, Stamp, Truth};
 
-/// Ticks that may still be waiting for something: at 10 Hz six seconds, longer than any detection takes.
+/// Largest number of incomplete ticks: at 10 Hz six seconds, longer than any detection takes.
 pub(super) const MOST_OPEN: usize = 64;
 
-/// What has come of one tick so far.
+/// Messages of one tick so far.
 #[derive(Default)]
 pub(super) struct Tick {
-    /// What was there, and when it was published, nanoseconds.
+    /// Ground truth and its time of publication, nanoseconds.
     pub(super) truth: Option<(u64, Truth)>,
-    /// What the ego makes of it, and when that was published, nanoseconds.
+    /// Result of the ego and its time of publication, nanoseconds.
     pub(super) result: Option<(u64, Detections)>,
-    /// Where the vehicles believe to be.
+    /// Pose estimates of the vehicles.
     pub(super) poses: Vec<(CavId, PoseEstimate)>,
-    /// When these were published, nanoseconds.
+    /// Times of publication of these, nanoseconds.
     pub(super) posed_nanos: Vec<u64>,
 }
 
-/// What comes of a tick.
+/// Message of a tick.
 pub(super) enum Part {
     Truth(Truth),
     Result(Detections),
     Pose(PoseEstimate),
 }
 
-/// The ticks that are open, by capture time.
+/// Incomplete ticks, by capture time.
 #[derive(Default)]
 pub(super) struct OpenTicks {
     open: BTreeMap<u64, Tick>,
@@ -35,8 +35,8 @@ pub(super) struct OpenTicks {
 }
 
 impl OpenTicks {
-    /// Adds a part to its tick: the first of its kind counts, and a closed tick stays closed. The oldest tick makes
-    /// room where too many are open, and is returned with its capture time.
+    /// Adds a message to its tick: the first of its kind counts, and a closed tick stays closed. If too many are open,
+    /// the oldest tick is removed and returned with its capture time.
     pub(super) fn add(&mut self, stamp: &Stamp, part: Part) -> Option<(u64, Tick)> {
         let capture_nanos = stamp.capture_nanos;
         if self.closed_until.is_some_and(|closed| capture_nanos <= closed) {
@@ -62,7 +62,7 @@ impl OpenTicks {
         closed
     }
 
-    /// Takes the oldest tick out.
+    /// Removes the oldest tick.
     pub(super) fn close_oldest(&mut self) -> Option<(u64, Tick)> {
         let (capture_nanos, tick) = self.open.pop_first()?;
         self.closed_until = Some(capture_nanos);

@@ -1,7 +1,7 @@
-//! `clock: stepped`: a scenario in virtual time, all of it in this process, or every agent in one of its own.
+//! `clock: stepped`: a scenario in simulation time, in this process alone, or with one process per agent.
 //!
-//! The run folder is that of a live run. Nothing in it but `scenario.yaml` and `log/` depends on machine, load, time of day
-//! or on how many processes there are.
+//! The run folder is that of a live run. Only `scenario.yaml` and `log/` depend on machine, load, time of day and
+//! number of processes.
 
 use std::collections::BTreeSet;
 use std::fs::File;
@@ -18,22 +18,23 @@ use localization::pose_source::PoseSourceConfig;
 use protocol::{CavId, DetectionsReport, RunId};
 use support::progress;
 
-use crate::experiment::evaluation::judge;
-use crate::experiment::fingerprint::Provenance;
-use crate::experiment::ledger_report::LedgerReport;
-use crate::experiment::metrics::Metrics;
-use crate::experiment::score::FrameScores;
+use crate::operate::RunError;
 use crate::operate::agent_pool::CrewProcesses;
 use crate::operate::fleet::{Fleet, FleetError, open_options};
-use crate::operate::run_fleet::{RunResult, UpError, UpOptions};
 use crate::operate::run_folder::{RunFolder, RunFolderError, name_of_now};
+use crate::run::ledger_report::LedgerReport;
+use crate::run::run_fleet::{RunResult, UpOptions};
+use crate::scenario::fingerprint::Provenance;
 use crate::scenario::{Scenario, Stepped};
+use crate::score::FrameScores;
+use crate::score::evaluated_frame::judge;
+use crate::score::metrics::Metrics;
 
-/// RunScope a scenario in virtual time to its end.
+/// Runs a scenario in simulation time to its end.
 ///
 /// # Errors
-/// [`UpError`] when the scenario makes no fleet, or a frame cannot be read or computed.
-pub fn up(scenario: &Scenario, options: &UpOptions) -> Result<RunResult, UpError> {
+/// [`RunError`] when no fleet can be built from the scenario, or a frame cannot be read or computed.
+pub fn up(scenario: &Scenario, options: &UpOptions) -> Result<RunResult, RunError> {
     let mut fleet = Fleet::plan(scenario)?;
     fleet.scenario.models.threads.apply();
     let recorded = recorded(&fleet)?;
@@ -42,27 +43,27 @@ pub fn up(scenario: &Scenario, options: &UpOptions) -> Result<RunResult, UpError
         Some(compute) => compute,
         None => evaluator.measure(&recorded)?,
     };
-    // Written into the run's scenario, from where another run can take it.
+    // Written into the run's scenario, from which another run can take it.
     let processes = fleet.scenario.stepped.is_some_and(|stepped| stepped.processes);
     fleet.scenario.stepped = Some(Stepped { compute: Some(compute), processes });
     let run = fleet.scenario.run.clone().unwrap_or_else(|| name_of_now(options.prefix));
     let mut evaluator = evaluator.with_link(stepped_config(&fleet, compute)?);
     let folder = RunFolder::create(&options.runs, &run)?;
     let result = go(&fleet, &recorded, &mut evaluator, (&run, &folder), options);
-    if result.as_ref().is_err_and(UpError::is_refusal) {
+    if result.as_ref().is_err_and(RunError::is_refusal) {
         folder.remove();
     }
     result
 }
 
-/// RunScope a fleet, as the run of that name in that folder.
+/// Runs a fleet under the given run name in the given folder.
 fn go(
     fleet: &Fleet,
     recorded: &Recorded,
     evaluator: &mut Evaluator,
     (run, folder): (&RunId, &RunFolder),
     options: &UpOptions,
-) -> Result<RunResult, UpError> {
+) -> Result<RunResult, RunError> {
     let processes = fleet.scenario.stepped.is_some_and(|stepped| stepped.processes);
     let crew = processes.then(|| CrewProcesses::start(fleet, run, folder, &options.programs)).transpose()?;
     let processes = crew.map(|(processes, remote)| {
@@ -76,7 +77,7 @@ fn go(
     Ok(RunResult { killed, ..result })
 }
 
-/// The recorded scenario that the fleet plays.
+/// Recorded scenario of the fleet.
 fn recorded(fleet: &Fleet) -> Result<Recorded, FleetError> {
     let scene = &fleet.scenario.scene;
     let scenarios = dataset::open_with(&scene.dir, &open_options(scene))?.scenarios;
@@ -130,18 +131,18 @@ fn vehicle(scenario: &Scenario, cav: &CavId) -> VehicleConfig {
     VehicleConfig { pose_source: for_scene(&pose, scenario), codec, rate, lie }
 }
 
-/// The source as an agent's process would be given it.
+/// The source as in the configuration of an agent's process.
 fn for_scene(pose: &PoseSourceConfig, scenario: &Scenario) -> PoseSourceConfig {
     pose.for_scenario(scenario.scene.scenario.as_deref().unwrap_or_default())
 }
 
-/// RunScope over the ticks; detections go to their file as they come.
+/// Computes all ticks; detections are appended to their file.
 fn play(
     fleet: &Fleet,
     recorded: &Recorded,
     evaluator: &mut Evaluator,
     folder: &RunFolder,
-) -> Result<FrameScores, UpError> {
+) -> Result<FrameScores, RunError> {
     let mut board = FrameScores::new(fleet.ego.clone(), fleet.ground_truth_rule(), fleet.map_values());
     let path = folder.file("detections.jsonl");
     let unwritable = |source| RunFolderError::Write { path: path.clone(), source };
@@ -166,7 +167,7 @@ fn write(
     board: &FrameScores,
     folder: RunFolder,
     options: &UpOptions,
-) -> Result<RunResult, UpError> {
+) -> Result<RunResult, RunError> {
     let ledger = evaluator.ledger();
     let balance = ledger.balance();
     let names = [fleet.scenario.method.name(), fleet.pose_source()];
@@ -180,12 +181,12 @@ fn write(
     let provenance = provenance.inspect_err(|error| tracing::warn!("no hashes in scenario.yaml: {error}")).ok();
     let resolved = Scenario { provenance, ..fleet.scenario.clone() };
     folder.write("scenario.yaml", &resolved.to_yaml())?;
-    let picture = crate::view::demo::draw(fleet, board, &folder.file("frame.png"));
+    let picture = crate::run::demo::draw(fleet, board, &folder.file("frame.png"));
     let (killed, unwritten, failures) = (Vec::new(), Vec::new(), Vec::new());
     Ok(RunResult { folder, metrics, balance, missed: 0, interrupted: false, killed, unwritten, failures, picture })
 }
 
-impl From<EvaluateError> for UpError {
+impl From<EvaluateError> for RunError {
     fn from(error: EvaluateError) -> Self {
         Self::Evaluate(Box::new(error))
     }

@@ -1,15 +1,15 @@
-//! The picture of a run: its richest frame, with the points of everyone who was fused.
+//! Picture of a run: the frame with the most neighbours, with the points of every fused vehicle.
 
 use std::path::{Path, PathBuf};
 
 use dataset::{self, LoadOptions};
 use protocol::{CavId, Pose};
 
-use crate::experiment::score::{FrameScores, JudgedFrame};
 use crate::operate::fleet::Fleet;
+use crate::score::{FrameScores, JudgedFrame};
 use crate::view::picture::{Picture, View};
 
-/// Draws the most telling frame of a run. A picture that cannot be drawn is a warning: the run itself is done.
+/// Draws that frame of a run. A picture that cannot be drawn is a warning: the run itself is complete.
 pub fn draw(fleet: &Fleet, board: &FrameScores, path: &Path) -> Option<PathBuf> {
     let frame = board.showpiece()?;
     match try_draw(fleet, frame, path) {

@@ -1,4 +1,4 @@
-//! The lattice of the refiner: laid over all cells before the training, cut to where cells are after it.
+//! Key grid of the refiner: laid over all cells before the training, cropped to the area of cells after it.
 
 use tch::nn::VarStore;
 use tch::{TchError, Tensor, no_grad};
@@ -7,19 +7,19 @@ use localization::pgc::LocalizerError;
 use localization::pgc::SceneHead;
 use localization::pgc::{RefinerConfig, SceneHeadConfig};
 
-/// Distance between corners, metres, and how many corners there may be: larger towns have a wider lattice.
+/// Smallest distance between corners, metres; a large scene has a coarser grid, since the number of corners is limited.
 const SPACING_M: f64 = 1.5;
 const CORNERS: f64 = 110_000.0;
-/// How far the refiner looks to each side, metres.
+/// Reach of the refiner to each side, metres.
 const REACH_M: f64 = 3.0;
 /// Channels of a key.
 const KEYS: i64 = 16;
-/// Share of the cells that may lie beyond each edge of the lattice that is kept in the end.
+/// Share of the cells that may lie beyond each edge of the cropped grid.
 const EDGE_SHARE: f64 = 0.003;
-/// What lies this far beyond the outermost cell is still town, metres.
+/// Margin around the outermost cells that still belongs to the scene, metres.
 const MARGIN_M: f64 = 8.0;
 
-/// A lattice that covers all cells, whose world coordinates `targets_m` `[N, 3]` are.
+/// A key grid that covers all cells, whose world coordinates are `targets_m` `[N, 3]`.
 pub(super) fn covering(targets_m: &Tensor, local_channels: i64) -> Result<RefinerConfig, TchError> {
     let bound = |extreme: Tensor, margin_m: f64| -> Result<[f64; 2], TchError> {
         let values: Vec<f32> = Vec::try_from(&extreme)?;
@@ -33,8 +33,8 @@ pub(super) fn covering(targets_m: &Tensor, local_channels: i64) -> Result<Refine
     Ok(RefinerConfig { local_channels, low_m, high_m, spacing_m, reach, keys: KEYS, width: 256 })
 }
 
-/// Cuts the edges of the lattice off that hardly any cell comes near, so that they need not be shipped; the trained
-/// variables that are left.
+/// Crops the edges of the key grid that hardly any cell is near, so that they need not be stored; the remaining trained
+/// variables.
 pub(super) fn crop(
     head: &mut SceneHeadConfig,
     variables: VarStore,
@@ -56,8 +56,8 @@ pub(super) fn crop(
     let trained = variables.variables();
     for (name, mut variable) in kept.variables() {
         let source = &trained[&name];
-        let is_lattice = matches!(name.as_str(), "refiner.keys" | "refiner.heights");
-        let source = if is_lattice { source.f_index_select(0, &rows)? } else { source.shallow_clone() };
+        let is_key_grid = matches!(name.as_str(), "refiner.keys" | "refiner.heights");
+        let source = if is_key_grid { source.f_index_select(0, &rows)? } else { source.shallow_clone() };
         no_grad(|| variable.f_copy_(&source))?;
     }
     Ok(kept)

@@ -1,11 +1,14 @@
-//! What a run is worth: detections against the truth, poses, delays, bytes, and whether every message is accounted for.
+//! Score of a run: detections against the truth, poses, latencies, bytes, and message accounting.
 
+pub mod evaluated_frame;
 mod frame_record;
 mod frame_scores;
 mod live_precision;
+pub mod metrics;
 mod neighbours;
 mod node;
 mod numbered_results;
+pub mod offline_intervals;
 mod open_ticks;
 mod result_lines;
 mod stage_stamps;

@@ -1,4 +1,4 @@
-//! What is kept of a judged frame.
+//! Record of a scored frame.
 
 use protocol::{Box3d, CavId, Detections, Pose};
 use serde::Serialize;
@@ -14,43 +14,43 @@ pub struct FrameRecord {
     pub agent_frame: u64,
     /// Capture time on the scene's clock, nanoseconds.
     pub capture_nanos: u64,
-    /// From the publication of the tick to that of its detections, milliseconds; none where nothing was published.
+    /// From the publication of the tick to that of its detections, milliseconds; `None` without a result.
     pub latency_ms: Option<f64>,
-    /// When the frame passed each stage; all open where nothing was published.
+    /// Time at which the frame passed each stage; all `None` without a result.
     pub stamps: StageStamps,
-    /// Boxes detected.
+    /// Number of detected boxes.
     pub detected: usize,
-    /// Boxes there were.
+    /// Number of true boxes.
     pub truth: usize,
-    /// Detections that overlap a true box by at least 0.5.
+    /// Number of detections that overlap a true box by at least 0.5.
     pub found: usize,
-    /// Neighbours whose data are in the result.
+    /// Number of neighbours whose data are in the result.
     pub fused: usize,
-    /// Neighbours whose data could not be, or that were out of range.
+    /// Number of neighbours whose data could not be fused, or that were out of range.
     pub skipped: usize,
-    /// Age of the oldest of what was fused: capture time of the ego's sweep less that of the neighbour's, milliseconds; none
-    /// where nothing was.
+    /// Age of the oldest fused data: capture time of the ego's sweep less that of the neighbour's, milliseconds; `None`
+    /// if no neighbour was fused.
     pub oldest_ms: Option<f64>,
-    /// Neighbours whose newest data were too old.
+    /// Number of neighbours whose newest data were too old.
     pub stale: usize,
-    /// Bytes of metadata and body of what was fused, over all neighbours.
+    /// Bytes of metadata and body of the fused messages, over all neighbours.
     pub payload_bytes: u64,
-    /// Bytes of everything those neighbours sent for it.
+    /// Bytes of all messages that those neighbours sent for the frame.
     pub wire_bytes: u64,
-    /// Distance of the ego's own pose from the truth, metres; empty where it had none.
+    /// Distance of the ego's own pose from the truth, metres; empty if it had none.
     pub ego_error_m: Option<f64>,
     /// Angle of the ego's own pose to the truth, degrees.
     pub ego_error_deg: Option<f64>,
 }
 
-/// A result and what it was judged against, for pictures.
+/// A result and its ground truth, for pictures.
 #[derive(Debug, Clone)]
 pub struct JudgedFrame {
     /// Tick of the scene, counted from 0.
     pub tick: u64,
-    /// The ego's result.
+    /// Result of the ego.
     pub result: Detections,
-    /// What was there, in the ego's LiDAR frame.
+    /// True boxes, in the ego's LiDAR frame.
     pub truth: Vec<Box3d>,
     /// True pose of every vehicle's LiDAR.
     pub world_from_lidar: Vec<(CavId, Pose)>,

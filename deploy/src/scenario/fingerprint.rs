@@ -1,4 +1,4 @@
-//! What exactly a run was made of: hashes of its programs, weights and scene.
+//! Provenance of a run: hashes of its programs, weights and scene.
 
 use std::fs::File;
 use std::io::{self, Read};
@@ -10,30 +10,30 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
-/// What a run was made of. Stands in the `scenario.yaml` of a run folder.
+/// Provenance of a run, part of the `scenario.yaml` of a run folder.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Provenance {
     /// Version of the programs.
     pub version: String,
-    /// SHA-256 over the executables, which lie in one folder.
+    /// SHA-256 over the executables of the program folder.
     pub program_sha256: String,
     /// SHA-256 of the weights file.
     pub weights_sha256: String,
-    /// SHA-256 of the localizer's encoder and of its head, where a vehicle finds its pose itself.
+    /// SHA-256 of the localizer's encoder and of its head, if a vehicle localizes itself.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub localizer_sha256: Option<[String; 2]>,
-    /// SHA-256 of the network that was trained end to end, where a vehicle finds its pose with that.
+    /// SHA-256 of the network that was trained end to end, if a vehicle localizes itself with it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub end_to_end_sha256: Option<String>,
     /// SHA-256 over names and contents of the scenario's point clouds and annotations; images do not count.
     pub scene_sha256: String,
-    /// Files that `scene_sha256` covers.
+    /// Number of files that `scene_sha256` covers.
     pub scene_files: usize,
 }
 
 impl Provenance {
-    /// Hashes everything a run is made of. Reads the whole scene: seconds for gigabytes.
+    /// Hashes programs, weights and scene. Reads the whole scene: seconds for gigabytes.
     ///
     /// # Errors
     /// The first file that cannot be read, by name.
@@ -61,7 +61,7 @@ impl Provenance {
     }
 }
 
-/// What a run reads of a scene: all but images, in the order of names.
+/// Files of a scene that a run reads: all but images, in the order of names.
 fn scene_files(scene: &Path) -> io::Result<Vec<PathBuf>> {
     if scene.is_file() {
         return Ok(vec![scene.to_path_buf()]);
@@ -83,7 +83,7 @@ fn scene_files(scene: &Path) -> io::Result<Vec<PathBuf>> {
     Ok(files)
 }
 
-/// One hash over many files: name below `root`, length and content of each. Where `root` lies does not count.
+/// One hash over many files: name below `root`, length and content of each. The path of `root` does not count.
 fn hash_all(root: &Path, files: &[PathBuf]) -> io::Result<String> {
     let mut all = Sha256::new();
     for path in files {

@@ -1,30 +1,30 @@
-//! When a frame passed each stage, from the capture to the detections.
+//! Time at which a frame passed each stage, from the capture to the detections.
 
 use protocol::StageTiming;
 
-/// Milliseconds after the publication of the tick; each is `None` where it is not known.
+/// Milliseconds after the publication of the tick; each is `None` if unknown.
 #[derive(Debug, Clone, Copy, PartialEq, Default, serde::Serialize)]
 pub struct StageStamps {
-    /// When the tick was published, Unix nanoseconds: where all others count from.
+    /// Time of publication of the tick, Unix nanoseconds: origin of all others.
     #[serde(skip)]
     pub began_nanos: Option<u64>,
-    /// The ego's agent knew where it was and said so.
+    /// Publication of the pose by the ego's agent.
     pub posed_ms: Option<f64>,
-    /// It handed its map, boxes or points to the network.
+    /// Publication of its feature map, boxes or points.
     pub published_ms: Option<f64>,
-    /// These reached the ego-fuser.
+    /// Arrival of these at the ego-fuser.
     pub arrived_ms: Option<f64>,
-    /// The ego-fuser stopped waiting for neighbours.
+    /// End of the wait for neighbours.
     pub decided_ms: Option<f64>,
-    /// It had its detections.
+    /// Detections computed.
     pub fused_ms: Option<f64>,
-    /// It handed them to the network.
+    /// Publication of the detections.
     pub detected_ms: Option<f64>,
 }
 
 impl StageStamps {
-    /// Stamps of a tick that was published at `began_nanos`, of which the ego's pose was published at `posed_nanos` and its
-    /// detections, with their `stages`, at `detected_nanos`.
+    /// Stamps of a tick with publication times, Unix nanoseconds: of the tick `began_nanos`, of the ego's pose
+    /// `posed_nanos`, of its detections `detected_nanos`. `stages` are the durations of the ego's stages.
     #[must_use]
     pub fn of(began_nanos: u64, posed_nanos: Option<u64>, detected_nanos: u64, stages: &[StageTiming]) -> Self {
         let since = |nanos: u64| ms_between(began_nanos, nanos);
@@ -88,7 +88,7 @@ mod tests {
     }
 
     #[test]
-    fn what_an_ego_does_not_tell_stays_open() {
+    fn stages_that_an_ego_does_not_report_are_absent() {
         let stamps = StageStamps::of(0, None, 5_000_000, &[]);
         assert_eq!(stamps, StageStamps { began_nanos: Some(0), detected_ms: Some(5.0), ..StageStamps::default() });
     }

@@ -139,7 +139,7 @@ fn poses_of_all_vehicles_are_judged() {
     board.pose(&stamp("n", 0, 0), PoseEstimate::new(Pose::from_xyz_yaw([20.0, 4.0, 0.0], 0.0), 0.5));
     let reason = protocol::NoPoseReason::TooFewPoints;
     board.pose(&stamp("e", 0, 0), PoseEstimate::NoPose { reason, inlier_count: 2 });
-    board.pose(&stamp("stranger", 0, 0), PoseEstimate::new(Pose::IDENTITY, 0.5));
+    board.pose(&stamp("unknown", 0, 0), PoseEstimate::new(Pose::IDENTITY, 0.5));
     board.truth(&stamp("replay", 0, 0), truth(0));
     board.close();
     let errors = board.pose_errors();

@@ -1,10 +1,10 @@
-//! What an ego is expected to find.
+//! Ground-truth boxes of an ego.
 
 use dataset::frame::{Frame, Object, ObjectClass};
 use dataset::ground_truth::{self, GroundTruthRule};
 use protocol::{AgentTruth, Box3d, CavId, Handedness, Truth};
 
-/// The boxes the ego is expected to find, in its LiDAR frame.
+/// Ground-truth boxes of the ego, in its LiDAR frame.
 #[must_use]
 pub fn true_boxes(truth: &Truth, ego: &CavId, rule: &GroundTruthRule) -> Vec<Box3d> {
     let frames: Vec<Frame> = truth.agents.iter().map(as_frame).collect();
@@ -13,7 +13,7 @@ pub fn true_boxes(truth: &Truth, ego: &CavId, rule: &GroundTruthRule) -> Vec<Box
     merged.into_iter().map(|(_, box3d)| box3d).collect()
 }
 
-/// The part of a recorded frame that the rule looks at.
+/// Part of a recorded frame that the rule reads.
 fn as_frame(agent: &AgentTruth) -> Frame {
     let class = |name: &str| serde_json::from_value(name.into()).unwrap_or(ObjectClass::Other);
     let objects = agent.objects.iter().map(|object| Object {

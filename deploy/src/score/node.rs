@@ -1,4 +1,4 @@
-//! The scorer's place on the bus: takes truth, detections, poses and everyone's books, and keeps the board.
+//! Scorer process on the bus: receives truth, detections, poses and the ledgers of all processes, and keeps the scores.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
@@ -17,37 +17,37 @@ use zenoh::Session;
 use super::FrameScores;
 use super::numbered_results::NumberedResults;
 use super::result_lines::ResultLines;
-use crate::operate::offline_intervals::OfflineIntervals;
+use crate::score::offline_intervals::OfflineIntervals;
 
 /// Name of the scorer in keys, ledgers and routes.
 const SCORER: &str = "scorer";
-/// Messages of one topic that may wait: seconds of a run.
+/// Largest number of waiting messages of one topic: seconds of a run.
 const PLACES: usize = 256;
-/// How long the end of the session may take.
+/// Longest time for closing the session.
 const LEAVE_LIMIT: Duration = Duration::from_millis(500);
 
-/// How a run goes, for those who watch.
+/// Progress of a run.
 #[derive(Debug, Clone, Default)]
 pub struct Progress {
-    /// Ticks published by the replay.
+    /// Number of ticks published by the replay.
     pub ticks: u64,
-    /// Results of the ego.
+    /// Number of results of the ego.
     pub frames: u64,
-    /// When the first and the last result came.
+    /// Arrival times of the first and the last result.
     pub span: Option<(Instant, Instant)>,
     /// From the publication of the tick to that of its result, milliseconds, of the last result.
     pub latency_ms: Option<f64>,
-    /// Neighbours in the last result.
+    /// Number of neighbours in the last result.
     pub fused: usize,
-    /// What the ego makes of those it heard for it.
+    /// Neighbours whose messages the ego received for the last result, and its judgement of each.
     pub heard: Vec<HeardNeighbour>,
-    /// Bytes of everything that was fused so far.
+    /// Bytes of all fused messages so far.
     pub wire_bytes: u64,
-    /// Messages dropped so far, by all processes.
+    /// Number of messages dropped so far, by all processes.
     pub dropped: u64,
-    /// The replay has said that nothing more will come.
+    /// True once the replay has announced the end of the scene.
     pub ended: bool,
-    /// When each process last told about itself, by name.
+    /// Time of the last report of each process, by name.
     pub told: BTreeMap<String, Instant>,
 }
 
@@ -61,64 +61,64 @@ impl Progress {
     }
 }
 
-/// The books of one life of a process.
+/// Ledger of one process instance.
 #[derive(Debug, Clone)]
 pub struct ProcessBooks {
-    /// Which process.
+    /// Name of the process.
     pub process: ProcessId,
-    /// Its messages.
+    /// Its message counters.
     pub ledger: Ledger,
     /// Its stages.
     pub stages: Vec<StageSummary>,
 }
 
-/// Lives of processes whose books are kept: a fleet of 65 vehicles that all fall a few times.
-const MAX_LIVES: usize = 1024;
+/// Largest number of process instances whose ledgers are kept: a fleet of 65 vehicles that all crash a few times.
+const MAX_INSTANCES: usize = 1024;
 
-/// The last books of every process and epoch.
+/// Last ledger of every process and epoch.
 type ScoreStats = BTreeMap<(ProcessId, u64), ProcessBooks>;
 
-/// Everything the scorer has at the end.
+/// Results of the scorer at the end.
 pub struct Scored {
     /// Detections against the truth.
     pub board: FrameScores,
-    /// The last word of every process, by process and life.
+    /// Last report of every process instance.
     pub books: Vec<ProcessBooks>,
-    /// How it went.
+    /// Progress of the run.
     pub progress: Progress,
-    /// Results that are not in the file, as there was no room for them.
+    /// Number of results that are not in the file, for lack of disk space.
     pub unwritten: u64,
 }
 
-/// Why the scorer cannot work.
+/// Reason why the scorer cannot start.
 #[derive(Debug, thiserror::Error)]
 pub enum ScorerError {
-    /// The bus refuses.
+    /// Error of the bus.
     #[error(transparent)]
     Bus(#[from] BusError),
-    /// A file or thread cannot be had.
+    /// A file or thread cannot be created.
     #[error("{what}: {source}")]
     Io {
-        /// What.
+        /// File or thread.
         what: String,
-        /// Why.
+        /// Error of the operating system.
         source: std::io::Error,
     },
 }
 
-/// A scorer at work.
+/// A running scorer.
 pub struct ScorerNode {
     bus: Bus,
     inbox: Arc<Inbox>,
     progress: Arc<Mutex<Progress>>,
     thread: JoinHandle<(FrameScores, ScoreStats, u64)>,
-    absences: OfflineIntervals,
+    offline: OfflineIntervals,
     _subscriptions: Vec<Subscription>,
     _presence: LivelinessToken,
 }
 
 impl ScorerNode {
-    /// Listens to the run of `agents` on `session`; results go to `detections_file` as they come, one JSON object a
+    /// Subscribes to the run of `agents` on `session`; results are appended to `detections_file`, one JSON object a
     /// line.
     ///
     /// # Errors
@@ -145,13 +145,13 @@ impl ScorerNode {
             subscriptions.push(bus.subscribe(Topic::Stream { cav: cav.clone(), stream: Stream::Pose }, &inbox)?);
         }
         let presence = bus.announce(Role::Scorer)?;
-        let absences = OfflineIntervals::watch(&bus)?;
+        let offline = OfflineIntervals::watch(&bus)?;
         let io = |what: String| move |source| ScorerError::Io { what, source };
         let detections = ResultLines::create(&detections_file).map_err(io(detections_file.display().to_string()))?;
         let progress = Arc::<Mutex<Progress>>::default();
         let worker = Worker {
             inbox: Arc::clone(&inbox),
-            bus_books: bus.books().clone(),
+            bus_stats: bus.books().clone(),
             board,
             books: BTreeMap::new(),
             progress: Arc::clone(&progress),
@@ -161,7 +161,7 @@ impl ScorerNode {
         };
         let thread = thread::Builder::new().name(SCORER.into()).spawn(move || worker.run());
         let thread = thread.map_err(io("the scorer's thread".into()))?;
-        Ok(Self { bus, inbox, progress, thread, absences, _subscriptions: subscriptions, _presence: presence })
+        Ok(Self { bus, inbox, progress, thread, offline, _subscriptions: subscriptions, _presence: presence })
     }
 
     /// Serves the scorer's own counters to Prometheus.
@@ -173,19 +173,19 @@ impl ScorerNode {
         Ok(())
     }
 
-    /// How it goes.
+    /// Progress so far.
     #[must_use]
     pub fn progress(&self) -> Progress {
         self.progress.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    /// Who was away so far, by process.
+    /// Processes that were offline so far.
     #[must_use]
     pub fn absent(&self) -> BTreeSet<String> {
-        self.absences.so_far()
+        self.offline.so_far()
     }
 
-    /// Ends the scorer after everything that has come in is judged.
+    /// Ends the scorer after every received message has been scored.
     ///
     /// # Panics
     /// When the scorer's own thread has panicked.
@@ -199,17 +199,17 @@ impl ScorerNode {
             stages: self.bus.books().stages(),
         };
         let progress = self.progress.lock().unwrap_or_else(PoisonError::into_inner).clone();
-        drop((self._subscriptions, self._presence, self.absences));
+        drop((self._subscriptions, self._presence, self.offline));
         if let Err(overdue) = self.bus.leave(LEAVE_LIMIT) {
             tracing::warn!("{overdue}");
         }
-        // Its own books went out like everyone's and came back; those in hand are newer.
+        // The scorer receives its own reports like those of others; its current counters are newer.
         let others = books.into_values().filter(|books| books.process != own.process);
         Scored { board, books: others.chain([own.clone()]).collect(), progress, unwritten }
     }
 }
 
-/// The scorer's name in place of a vehicle's.
+/// Id of the scorer in place of a vehicle's.
 ///
 /// # Panics
 /// Never: the name is an identifier.
@@ -218,16 +218,16 @@ pub fn scorer_cav() -> CavId {
     CavId::new(SCORER).expect("six lower-case letters")
 }
 
-/// The scorer's thread.
+/// Thread of the scorer.
 struct Worker {
     inbox: Arc<Inbox>,
-    bus_books: bus::MessageStats,
+    bus_stats: bus::MessageStats,
     board: FrameScores,
     books: ScoreStats,
     progress: Arc<Mutex<Progress>>,
     detections: ResultLines,
     numbered: NumberedResults,
-    // When each recent tick was published, by capture time: for the latency that is shown while the run goes.
+    // Time of publication of each recent tick, by capture time: for the latency that is displayed during the run.
     published: BTreeMap<u64, u64>,
 }
 
@@ -254,9 +254,9 @@ impl Worker {
             Topic::Stats(sender) => return self.stats(sender, arrival),
             _ => None,
         };
-        // An unsound message is counted where it is decoded.
+        // An invalid message is counted where it is decoded.
         if used.is_some() {
-            self.bus_books.received(topic);
+            self.bus_stats.received(topic);
         }
     }
 
@@ -312,14 +312,14 @@ impl Worker {
 
     fn stats(&mut self, sender: &ProcessId, arrival: &Arrival) {
         let Some(Stats { process, ledger, stages }) = self.inbox.decode(arrival, &Limits::DEFAULT) else { return };
-        // A process that was started again has another epoch: both lives count.
-        let life = (process.clone(), arrival.header.stamp.epoch);
-        let has_room = self.books.len() < MAX_LIVES || self.books.contains_key(&life);
+        // A restarted process has another epoch: both instances count.
+        let instance = (process.clone(), arrival.header.stamp.epoch);
+        let has_room = self.books.len() < MAX_INSTANCES || self.books.contains_key(&instance);
         if process != *sender || !has_room {
-            return tracing::warn!(%sender, %process, "books of another process, or of too many: not taken");
+            return tracing::warn!(%sender, %process, "report with another process's name, or of too many processes: ignored");
         }
         let (name, at) = (process.to_string(), arrival.at);
-        self.books.insert(life, ProcessBooks { process, ledger, stages });
+        self.books.insert(instance, ProcessBooks { process, ledger, stages });
         let dropped = self.books.values().map(|books| books.ledger.total().dropped_total()).sum();
         self.note(|progress| {
             progress.dropped = dropped;

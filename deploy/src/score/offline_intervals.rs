@@ -1,8 +1,8 @@
-//! Who was away for a while during a run, and of whose messages therefore nobody can tell what became of them.
+//! Offline intervals of processes: messages to or from an offline process are exempt from reconciliation.
 //!
-//! The books of a process that is killed end with what it told last, up to half a second before; what is sent to one that
-//! is not there, or over a connection that breaks, arrives nowhere. Such accounts are exempted by name, in the ledger and
-//! in the report; all others have to add up.
+//! The counters of a process that is killed end with its last report, up to half a second before; a message to an
+//! offline process, or over a connection that breaks, arrives nowhere. Such accounts are exempt, by name, in the ledger
+//! and in the report; all others have to balance.
 
 use std::collections::BTreeSet;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -12,7 +12,7 @@ use protocol::{Account, Role, Stream, Topic};
 
 const ROLES: [Role; 4] = [Role::Agent, Role::Ego, Role::Link, Role::Replay];
 
-/// Notes who vanishes and comes back.
+/// Records the processes that leave and rejoin.
 pub struct OfflineIntervals {
     state: Arc<Mutex<State>>,
     _watches: Vec<LivelinessSubscription>,
@@ -20,14 +20,14 @@ pub struct OfflineIntervals {
 
 #[derive(Default)]
 struct State {
-    /// Gone now.
+    /// Offline now.
     gone: BTreeSet<String>,
-    /// Were gone and came back.
+    /// Were offline and rejoined.
     returned: BTreeSet<String>,
 }
 
 impl OfflineIntervals {
-    /// Watches everyone on `bus`.
+    /// Watches every role on `bus`.
     ///
     /// # Errors
     /// [`BusError::Zenoh`] when the session is closed.
@@ -35,9 +35,9 @@ impl OfflineIntervals {
         let state = Arc::<Mutex<State>>::default();
         let watch = |role| {
             let state = Arc::clone(&state);
-            bus.watch(role, move |sighting| {
+            bus.watch(role, move |event| {
                 let mut state = state.lock().unwrap_or_else(PoisonError::into_inner);
-                match sighting {
+                match event {
                     LivelinessEvent::Vanished { role, cav } => {
                         state.gone.insert(process_id(role, &cav).to_string());
                     }
@@ -53,8 +53,8 @@ impl OfflineIntervals {
         Ok(Self { _watches: ROLES.into_iter().map(watch).collect::<Result<_, _>>()?, state })
     }
 
-    /// Who was away so far, by process. One that is gone for good counts too, but for the replay, which goes when the scene
-    /// is over.
+    /// Processes that were offline so far. One that does not return counts too, except the replay, which leaves when
+    /// the scene is over.
     #[must_use]
     pub fn so_far(&self) -> BTreeSet<String> {
         let state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
@@ -63,9 +63,9 @@ impl OfflineIntervals {
     }
 }
 
-/// Whether one of those whom an account concerns was away: who sends, who receives, the link between.
+/// True if a process that the account concerns was offline: sender, receiver or the link between them.
 #[must_use]
-pub fn concerns(away: &BTreeSet<String>, account: &Account) -> bool {
+pub fn concerns(offline: &BTreeSet<String>, account: &Account) -> bool {
     let replay = Role::Replay.to_string();
     let agent = |cav| process_id(Role::Agent, cav).to_string();
     let mut concerned: Vec<String> = match &account.topic {
@@ -82,10 +82,10 @@ pub fn concerns(away: &BTreeSet<String>, account: &Account) -> bool {
     };
     if let Some(to) = &account.to {
         concerned.push(to.to_string());
-        // What an ego hears may have come through its link.
+        // An ego receives messages of neighbours through its link.
         concerned.extend(to.as_str().strip_prefix("ego-").map(|ego| format!("link-{ego}")));
     }
-    concerned.iter().any(|name| away.contains(name))
+    concerned.iter().any(|name| offline.contains(name))
 }
 
 #[cfg(test)]
@@ -94,11 +94,11 @@ mod tests {
 
     #[test]
     fn an_account_concerns_sender_receiver_and_link() {
-        let concerns = |topic: &str, to: &str, away: &str| {
+        let concerns = |topic: &str, to: &str, offline: &str| {
             let account = Account::towards(topic.parse().unwrap(), &to.parse().unwrap());
-            super::concerns(&BTreeSet::from([away.to_owned()]), &account)
+            super::concerns(&BTreeSet::from([offline.to_owned()]), &account)
         };
-        for (topic, to, away) in [
+        for (topic, to, offline) in [
             ("20/bev", "ego-10", "agent-20"),
             ("20/bev", "ego-10", "ego-10"),
             ("20/bev", "ego-10", "link-10"),
@@ -106,7 +106,7 @@ mod tests {
             ("truth", "scorer", "replay"),
             ("10/detections", "scorer", "ego-10"),
         ] {
-            assert!(concerns(topic, to, away), "{topic} {to} {away}");
+            assert!(concerns(topic, to, offline), "{topic} {to} {offline}");
             assert!(!concerns(topic, to, "agent-30"), "{topic} {to}");
         }
         assert!(!concerns("20/lidar", "agent-20", "link-10"));
