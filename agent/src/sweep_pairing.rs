@@ -11,7 +11,7 @@ const MAX_POSES: usize = 32;
 
 /// A sweep and its pose, if that has arrived.
 #[derive(Debug, PartialEq)]
-pub struct PairedSweep<S> {
+pub(crate) struct PairedSweep<S> {
     /// Capture time, nanoseconds.
     pub capture_nanos: u64,
     /// The sweep.
@@ -22,7 +22,7 @@ pub struct PairedSweep<S> {
 
 /// Holds the newest sweep until its pose arrives, or is known to be lost.
 #[derive(Debug)]
-pub struct SweepPairing<S> {
+pub(crate) struct SweepPairing<S> {
     timeout: Duration,
     waiting: Option<(u64, S, Instant)>,
     poses: BTreeMap<u64, Pose>,
@@ -31,14 +31,14 @@ pub struct SweepPairing<S> {
 impl<S> SweepPairing<S> {
     /// Pairing with at most `timeout` of waiting for the pose of a sweep.
     #[must_use]
-    pub fn new(timeout: Duration) -> Self {
+    pub(crate) fn new(timeout: Duration) -> Self {
         Self { timeout, waiting: None, poses: BTreeMap::new() }
     }
 
     /// Adds a pose. Returns how many others were dropped: the oldest if there are too many, and those of later sweeps.
     /// Poses arrive in order, so a later one is left over from before the scene restarted.
     #[must_use]
-    pub fn add_pose(&mut self, capture_nanos: u64, pose: Pose) -> usize {
+    pub(crate) fn add_pose(&mut self, capture_nanos: u64, pose: Pose) -> usize {
         let left_over = self.take_later(capture_nanos).len();
         let replaced = usize::from(self.poses.insert(capture_nanos, pose).is_some());
         let too_many = self.poses.len().saturating_sub(MAX_POSES);
@@ -56,12 +56,12 @@ impl<S> SweepPairing<S> {
 
     /// Adds a sweep. Returns the one that it replaces.
     #[must_use]
-    pub fn add_sweep(&mut self, capture_nanos: u64, sweep: S, now: Instant) -> Option<S> {
+    pub(crate) fn add_sweep(&mut self, capture_nanos: u64, sweep: S, now: Instant) -> Option<S> {
         self.waiting.replace((capture_nanos, sweep, now)).map(|(_, superseded, _)| superseded)
     }
 
     /// The sweep, if there is nothing left to wait for, and the number of poses without a sweep.
-    pub fn next(&mut self, now: Instant) -> Option<(PairedSweep<S>, usize)> {
+    pub(crate) fn next(&mut self, now: Instant) -> Option<(PairedSweep<S>, usize)> {
         let &(capture_nanos, _, since) = self.waiting.as_ref()?;
         let pose = self.poses.get(&capture_nanos).copied();
         // Poses arrive in order: a later one shows that this sweep's own is lost.
@@ -78,7 +78,7 @@ impl<S> SweepPairing<S> {
 
     /// Time of the next call of [`Self::next`] if nothing arrives.
     #[must_use]
-    pub fn deadline(&self) -> Option<Instant> {
+    pub(crate) fn deadline(&self) -> Option<Instant> {
         self.waiting.as_ref().map(|(_, _, since)| *since + self.timeout)
     }
 }
