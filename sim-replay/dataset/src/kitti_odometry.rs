@@ -15,6 +15,7 @@ use super::points::{SweepStorage, Sweeps};
 use super::{FrameSource, Layout, OpenOptions, ReadError, Scenario, Tick, files, single_vehicle};
 use crate::frame::Frame;
 use crate::pcd::PcdCloud;
+use support::rounding;
 
 /// A sequence.
 #[derive(Debug)]
@@ -158,7 +159,7 @@ fn times(
         if !(0.0..=1e9).contains(&seconds) {
             return Err(kitti_text::malformed(&path, line, None, format!("{seconds} s, expected 0 to 1e9")));
         }
-        Ok((seconds * 1e9).round() as u64)
+        Ok(rounding::to_u64(seconds * 1e9))
     })?;
     faults.report("scan", problems);
     let needed = scans.iter().map(|(scan, _)| scan + 1).max().unwrap_or(0);

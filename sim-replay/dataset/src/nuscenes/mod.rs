@@ -208,7 +208,7 @@ impl Builder<'_> {
         problems: &mut Vec<ReadError>,
     ) -> Vec<u64> {
         let micros: Vec<u64> = moments.iter().map(|(sample, _)| sample.micros).collect();
-        if micros.windows(2).all(|pair| pair[0] < pair[1]) {
+        if micros.array_windows().all(|[a, b]| a < b) {
             let start = micros.first().copied().unwrap_or(0);
             return micros.iter().map(|micros| (micros - start).saturating_mul(1000)).collect();
         }

@@ -33,6 +33,7 @@ pub(super) struct QuarterTurns(u8);
 
 impl QuarterTurns {
     /// The turns that bring x nearest to the vehicle's.
+    #[expect(clippy::cast_possible_truncation, reason = "0 to 3 turns")]
     pub(super) fn to_forward(vehicle_from_lidar: &Isometry3<f64>) -> Self {
         let x = vehicle_from_lidar.rotation * Vector3::x();
         let turns = (x.y.atan2(x.x) / FRAC_PI_2).round() as i64;
