@@ -15,7 +15,6 @@ use serde::{Deserialize, Serialize};
 
 pub use config::ProtocolConfig;
 pub use preset::PRESETS;
-pub(crate) use preset::preset_of_layout;
 
 use crate::Scenario;
 use crate::ground_truth::GroundTruthRule;

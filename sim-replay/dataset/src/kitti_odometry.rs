@@ -11,11 +11,22 @@ use protocol::{CavId, Handedness, Pose};
 
 use super::faults::Faults;
 use super::kitti_text::{self, Calibration};
+use super::layouts::{LayoutRow, Reader};
 use super::points::{SweepStorage, Sweeps};
 use super::{FrameSource, Layout, OpenOptions, ReadError, Scenario, Tick, files, single_vehicle};
 use crate::frame::Frame;
 use crate::pcd::PcdCloud;
 use support::rounding;
+
+/// KITTI odometry.
+pub(crate) static KITTI_ODOMETRY: LayoutRow = LayoutRow {
+    key: "kitti_odometry",
+    name: "KITTI odometry",
+    data_sets: "KITTI odometry, SemanticKITTI",
+    files: "velodyne/<scan>.bin and calib.txt (a file)",
+    protocol: "opv2v",
+    reader: Some(Reader::Sequence { is_one: is_sequence, open }),
+};
 
 /// A sequence.
 #[derive(Debug)]
@@ -54,7 +65,7 @@ pub(super) fn open(
     let files = ticks.iter().map(|tick| velodyne.join(format!("{}.bin", tick.stem)));
     let sweeps = Sweeps::of_single_vehicle(SweepStorage::ByName, files, options);
     let source = Sequence { dir: dir.to_owned(), world_from_lidar: poses, sweeps };
-    Ok(single_vehicle(files::name_below(root, dir), Layout::KittiOdometry, ticks, Arc::new(source)))
+    Ok(single_vehicle(files::name_below(root, dir), Layout::KITTI_ODOMETRY, ticks, Arc::new(source)))
 }
 
 /// Number and stem of the scans. Files of other names are left out.
@@ -202,7 +213,7 @@ mod tests {
         build(dir.path(), "sequences/07", "poses/07.txt", poses);
         let dataset = crate::open(dir.path()).unwrap();
         let scenario = &dataset.scenarios[0];
-        assert_eq!((dataset.layout, scenario.name.as_str()), (Layout::KittiOdometry, "sequences/07"));
+        assert_eq!((dataset.layout, scenario.name.as_str()), (Layout::KITTI_ODOMETRY, "sequences/07"));
         let frame = scenario.load(0, 1, &LoadOptions::default()).unwrap();
         let moved = frame.world_from_lidar.unwrap().translation_m;
         assert!((moved[0] - 2.0).abs() < 1e-9 && (moved[1] + 1.0).abs() < 1e-9 && moved[2].abs() < 1e-9, "{moved:?}");

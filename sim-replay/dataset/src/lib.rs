@@ -45,6 +45,7 @@ mod numpy_tags;
 mod nuscenes;
 mod open;
 mod opv2v;
+mod opv2v_family;
 pub mod pcd;
 mod points;
 mod poses;
@@ -64,7 +65,7 @@ use protocol::{CavId, Handedness};
 use serde::Serialize;
 
 pub use error::ReadError;
-pub use layouts::{LAYOUTS, Layout, LayoutDescription, layouts_text};
+pub use layouts::{LAYOUTS, Layout, LayoutRow, layouts_text};
 pub use left_out::LeftOut;
 pub use listing::content_sha256;
 pub use open::{OpenOptions, open, open_with};
