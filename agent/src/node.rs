@@ -12,7 +12,9 @@ use bus::shutdown::Stop;
 use bus::{Arrival, Bus, BusError, Event, Inbox, MessageStats, Publisher, PublisherOptions, Subscription, unix_nanos};
 use protocol::codec::CodecConfig;
 use protocol::message::{Bev, Boxes, Descriptor, Points};
-use protocol::{DropReason, Dtype, Gnss, Lidar, Limits, PointCloud, PoseEstimate, Role, Stream, Topic, wire};
+use protocol::{
+    DropReason, Dtype, EgoMotion, Gnss, Lidar, Limits, PointCloud, PoseEstimate, Role, Stream, Topic, wire,
+};
 use support::nanos;
 
 use crate::agent::{Agent, AgentInput, Perception};
@@ -204,7 +206,12 @@ impl<'a> Node<'a> {
             self.bus.books().timed("lidar transport", Duration::from_nanos(transport));
             self.bus.books().received(&self.lidar);
             let arrived_nanos = unix_nanos().saturating_sub(nanos::of(sweep.at.elapsed()));
-            self.process(&AgentInput { capture_nanos, cloud: &points, measured_pose: pose.as_ref() });
+            self.process(&AgentInput {
+                capture_nanos,
+                cloud: &points,
+                measured_pose: pose.as_ref(),
+                motion: EgoMotion::default(),
+            });
             // Logged after everything is submitted.
             if let Some(Err(error)) = self.sweep_log.as_mut().map(|log| log.note(capture_nanos, arrived_nanos)) {
                 tracing::warn!("arrivals of sweeps are no longer logged: {error}");

@@ -34,6 +34,14 @@ fn pose_at(translation_m: [f64; 3]) -> Pose {
     Pose { translation_m, rotation_wxyz: [0.8, 0.0, 0.0, 0.6] }
 }
 
+pub(crate) fn tracked_pose() -> PoseEstimate {
+    PoseEstimate::Pose {
+        world_from_cav: pose_at([120.5, -30.25, 1.75]),
+        confidence: 0.875,
+        covariance: Some(PlanarCovariance { xx_m2: 0.04, xy_m2: -0.01, yy_m2: 0.09, yaw_rad2: 0.0001 }),
+    }
+}
+
 pub(crate) fn pose() -> PoseEstimate {
     PoseEstimate::new(pose_at([120.5, -30.25, 1.75]), 0.875)
 }
@@ -150,6 +158,7 @@ pub(crate) fn every_kind() -> Vec<Message> {
             source: GnssSource::Gnss,
         }),
         Message::Pose(pose()),
+        Message::Pose(tracked_pose()),
         Message::Pose(PoseEstimate::NoPose { reason: NoPoseReason::TooFewInliers, inlier_count: 4 }),
         Message::Boxes(Boxes { pose: pose(), detections: vec![detection(0.25); 5] }),
         Message::Points(Points { pose: pose(), points: points() }),

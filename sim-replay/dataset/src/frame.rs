@@ -4,7 +4,7 @@
 
 use std::str::FromStr;
 
-use protocol::{CavId, Handedness, PointCloud, Pose};
+use protocol::{CavId, EgoMotion, Handedness, PointCloud, Pose};
 use serde::{Deserialize, Serialize};
 
 use crate::Problem;
@@ -119,6 +119,12 @@ pub struct Frame {
 }
 
 impl Frame {
+    /// Motion of the vehicle, as far as it is recorded.
+    #[must_use]
+    pub fn motion(&self) -> EgoMotion {
+        EgoMotion { speed_mps: self.speed_mps, yaw_rate_rad_s: None }
+    }
+
     /// An empty frame.
     #[must_use]
     pub fn empty(cav: CavId, capture_nanos: u64, source_handedness: Handedness) -> Self {

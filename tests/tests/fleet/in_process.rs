@@ -263,6 +263,7 @@ fn play_offline(scenario: &Scenario, method: Method) -> Vec<(u64, Vec<Detection>
                     capture_nanos: tick.capture_nanos,
                     cloud: &frame.points,
                     measured_pose: frame.world_from_lidar.as_ref(),
+                    motion: frame.motion(),
                 };
                 let output = agent.process(&input).unwrap();
                 let content = match method.own_content() {
@@ -359,6 +360,7 @@ impl ScriptedAgent {
             capture_nanos: tick.capture_nanos,
             cloud: &frame.points,
             measured_pose: frame.world_from_lidar.as_ref(),
+            motion: frame.motion(),
         };
         let output = self.agent.process(&input).unwrap();
         let pose = output.pose;

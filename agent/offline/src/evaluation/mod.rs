@@ -10,7 +10,7 @@ use dataset::frame::Frame;
 use dataset::{self, LeftOut, LoadOptions, Problem, ReadError, Scenario};
 use protocol::{CavId, Pose, PoseEstimate};
 
-pub use summary::{CalibrationBin, LocalizationSummary, WithheldSummary, reliability_charts};
+pub use summary::{CalibrationBin, IntegritySummary, LocalizationSummary, WithheldSummary, reliability_charts};
 pub use table::{write_csv, write_error_table};
 
 use localization::pgc::LocalizerError;
@@ -142,8 +142,10 @@ pub fn evaluate_source(
         let measured = frame.gnss_world_from_lidar();
         let Frame { cav, capture_nanos, points, .. } = frame;
         let start = Instant::now();
-        let input = PoseInput { cav, capture_nanos: *capture_nanos, cloud: points, measured: measured.as_ref() };
+        let (capture_nanos, motion) = (*capture_nanos, frame.motion());
+        let input = PoseInput { cav, capture_nanos, cloud: points, measured: measured.as_ref(), motion };
         let estimate = source.estimate(&input);
+        source.observe(&input);
         Ok(Localization::told(estimate, LocalizerTimes { solve: start.elapsed(), ..LocalizerTimes::default() }))
     };
     evaluate_with(&mut ask, options, on_sweep)
