@@ -101,9 +101,10 @@ impl Agent {
         self.pose_source.estimate(&pose_input(&self.cav, input))
     }
 
-    /// Last step, after everything of the sweep was published: measures for the poses of later sweeps.
-    pub fn observe(&mut self, input: &AgentInput<'_>) {
-        self.pose_source.observe(&pose_input(&self.cav, input));
+    /// Last step, after everything of the sweep was published: measures for the poses of later sweeps. True if the
+    /// sweep was measured.
+    pub fn observe(&mut self, input: &AgentInput<'_>) -> bool {
+        self.pose_source.observe(&pose_input(&self.cav, input))
     }
 
     /// Last step if there is no queue: the feature map as `codec` specifies, or smaller if a limit requires it. A live

@@ -12,16 +12,14 @@ use bus::shutdown::Stop;
 use bus::{Arrival, Bus, BusError, Event, Inbox, MessageStats, Publisher, PublisherOptions, Subscription, unix_nanos};
 use protocol::codec::CodecConfig;
 use protocol::message::{Bev, Boxes, Descriptor, Points};
-use protocol::{
-    DropReason, Dtype, EgoMotion, Gnss, Lidar, Limits, PointCloud, PoseEstimate, Role, Stream, Topic, wire,
-};
+use protocol::{DropReason, Dtype, Gnss, Lidar, Limits, PointCloud, PoseEstimate, Role, Stream, Topic, wire};
 use support::nanos;
 
 use crate::agent::{Agent, AgentInput, Perception};
 use crate::output_filter::{OutputFilter, Unfiltered};
 use crate::rate::{RateConfig, RateControl, Turn};
 use crate::sweep_log::SweepLog;
-use crate::sweep_pairing::{PairedSweep, SweepPairing};
+use crate::sweep_pairing::{PairedSweep, SweepPairing, Unused};
 
 /// Longest time that a sweep waits for its pose, which was sent before it.
 const POSE_TIMEOUT: Duration = Duration::from_millis(200);
@@ -110,11 +108,12 @@ struct Node<'a> {
     inbox: Arc<Inbox>,
     lidar: Topic,
     gnss: Topic,
+    imu: Topic,
     pairing: SweepPairing<Arrival>,
     publishers: Publishers,
     report: NodeReport,
     sweep_log: Option<SweepLog>,
-    _subscriptions: [Subscription; 2],
+    _subscriptions: [Subscription; 3],
 }
 
 impl<'a> Node<'a> {
@@ -126,16 +125,19 @@ impl<'a> Node<'a> {
         stop: &Stop,
     ) -> Result<Self, BusError> {
         let topic = |stream| Topic::Stream { cav: agent.cav().clone(), stream };
-        let (lidar, gnss) = (topic(Stream::Lidar), topic(Stream::Gnss));
+        let (lidar, gnss, imu) = (topic(Stream::Lidar), topic(Stream::Gnss), topic(Stream::Imu));
         // One slot: while a sweep is computed only the newest of those that arrive is kept.
-        let inbox = bus.inbox(1, 2);
+        let inbox = bus.inbox(1, 3);
         stop.on_request({
             let inbox = Arc::clone(&inbox);
             move || inbox.close()
         });
         let publishers = Publishers::open(bus, &agent, options)?;
-        let subscriptions =
-            [bus.subscribe_keeping(gnss.clone(), POSE_SLOTS, &inbox)?, bus.subscribe(lidar.clone(), &inbox)?];
+        let subscriptions = [
+            bus.subscribe_keeping(gnss.clone(), POSE_SLOTS, &inbox)?,
+            bus.subscribe_keeping(imu.clone(), POSE_SLOTS, &inbox)?,
+            bus.subscribe(lidar.clone(), &inbox)?,
+        ];
         let pairing = SweepPairing::new(POSE_TIMEOUT);
         let sweep_log = options.sweep_log.as_deref().map(SweepLog::open).transpose();
         let sweep_log = sweep_log.unwrap_or_else(|error| {
@@ -150,6 +152,7 @@ impl<'a> Node<'a> {
             inbox,
             lidar,
             gnss,
+            imu,
             pairing,
             publishers,
             report: NodeReport::default(),
@@ -184,23 +187,29 @@ impl<'a> Node<'a> {
             if superseded.is_some() {
                 self.bus.books().dropped(&self.lidar, DropReason::Superseded);
             }
+        } else if arrival.topic == self.imu {
+            if let Some(motion) = self.inbox.decode(&arrival, &self.options.limits) {
+                let motions = self.pairing.add_motion(capture_nanos, motion);
+                self.count_unused(Unused { motions, ..Unused::default() });
+            }
         } else if let Some(Gnss { world_from_lidar, .. }) = self.inbox.decode(&arrival, &self.options.limits) {
-            let displaced = self.pairing.add_pose(capture_nanos, world_from_lidar);
-            self.drop_poses(displaced);
+            let poses = self.pairing.add_pose(capture_nanos, world_from_lidar);
+            self.count_unused(Unused { poses, ..Unused::default() });
         }
     }
 
-    fn drop_poses(&self, count: usize) {
-        // Their sweeps were superseded, and they with them.
-        (0..count).for_each(|_| self.bus.books().dropped(&self.gnss, DropReason::Superseded));
+    /// Counts measurements whose sweeps were superseded, and they with them.
+    fn count_unused(&self, unused: Unused) {
+        for (topic, count) in [(&self.gnss, unused.poses), (&self.imu, unused.motions)] {
+            (0..count).for_each(|_| self.bus.books().dropped(topic, DropReason::Superseded));
+        }
     }
 
     fn advance(&mut self, now: Instant) {
-        while let Some((PairedSweep { capture_nanos, sweep, pose }, unused)) = self.pairing.next(now) {
-            self.drop_poses(unused);
-            if pose.is_some() {
-                self.bus.books().received(&self.gnss);
-            }
+        while let Some(PairedSweep { capture_nanos, sweep, pose, motion, unused }) = self.pairing.next(now) {
+            self.count_unused(unused);
+            let used = [(&self.gnss, pose.is_some()), (&self.imu, motion.is_some())];
+            used.iter().filter(|(_, is_used)| *is_used).for_each(|(topic, _)| self.bus.books().received(topic));
             let transport = unix_nanos().saturating_sub(sweep.header.stamp.publish_nanos);
             let Some(Lidar { points }) = self.inbox.decode(&sweep, &self.options.limits) else { continue };
             self.bus.books().timed("lidar transport", Duration::from_nanos(transport));
@@ -210,7 +219,7 @@ impl<'a> Node<'a> {
                 capture_nanos,
                 cloud: &points,
                 measured_pose: pose.as_ref(),
-                motion: EgoMotion::default(),
+                motion: motion.unwrap_or_default(),
             });
             // Logged after everything is submitted.
             if let Some(Err(error)) = self.sweep_log.as_mut().map(|log| log.note(capture_nanos, arrived_nanos)) {
@@ -226,9 +235,7 @@ impl<'a> Node<'a> {
         let pose = self.filter.pose(self.agent.estimate_pose(input));
         books.timed("pose", began.elapsed());
         self.publishers.pose.offer(input.capture_nanos, pose);
-        for stage in self.agent.pose_stages() {
-            books.timed(&stage.stage, Duration::from_nanos(stage.nanos));
-        }
+        self.time_pose_stages();
         self.report.no_pose += u64::from(pose.world_from_cav().is_none());
         self.report.pose_jumps = self.agent.pose_jumps();
         match self.agent.perceive(input.cloud) {
@@ -242,11 +249,29 @@ impl<'a> Node<'a> {
                 let shared = self.publishers.points.is_some().then(|| self.agent.share_points(input.cloud));
                 let shared = shared.map(|points| self.filter.points(points));
                 self.publishers.offer(input, pose, perception, shared, books);
+                self.observe(input);
             }
             Err(error) => {
                 self.report.failed += 1;
                 tracing::error!(capture_nanos = input.capture_nanos, "cannot compute a sweep: {error}");
             }
+        }
+    }
+}
+
+impl Node<'_> {
+    /// Measures for the poses of later sweeps, after everything of this one is submitted.
+    fn observe(&mut self, input: &AgentInput<'_>) {
+        let began = Instant::now();
+        if self.agent.observe(input) {
+            self.time_pose_stages();
+            self.bus.books().timed("pose measurement", began.elapsed());
+        }
+    }
+
+    fn time_pose_stages(&self) {
+        for stage in self.agent.pose_stages() {
+            self.bus.books().timed(&stage.stage, Duration::from_nanos(stage.nanos));
         }
     }
 }

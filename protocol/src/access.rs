@@ -144,7 +144,15 @@ impl Principal {
 /// Limits of message sizes, bytes, by key, in any run.
 #[must_use]
 pub fn size_limits() -> Vec<(Vec<KeyExpr>, usize)> {
-    let small = [Stream::Pose, Stream::Gnss, Stream::Preview, Stream::Descriptor, Stream::Boxes, Stream::Detections];
+    let small = [
+        Stream::Pose,
+        Stream::Gnss,
+        Stream::Imu,
+        Stream::Preview,
+        Stream::Descriptor,
+        Stream::Boxes,
+        Stream::Detections,
+    ];
     let keys = |stream| [format!("*/{stream}"), format!("rx/*/*/{stream}")];
     let selectors = |topics: Vec<String>| topics.iter().map(|topics| KeyExpr::within(&RunScope::Any, topics)).collect();
     let limit = |stream: Stream| Some((selectors(keys(stream).into()), stream.most_bytes()?));
@@ -154,7 +162,7 @@ pub fn size_limits() -> Vec<(Vec<KeyExpr>, usize)> {
 }
 
 /// Streams that the replay publishes for vehicles, without cameras.
-const SENSORS: [Stream; 3] = [Stream::Lidar, Stream::Gnss, Stream::Radar];
+const SENSORS: [Stream; 4] = [Stream::Lidar, Stream::Gnss, Stream::Imu, Stream::Radar];
 /// Streams of agents.
 const SHARED: [Stream; 5] = [Stream::Pose, Stream::Bev, Stream::Boxes, Stream::Points, Stream::Descriptor];
 /// Streams of an ego for all principals.

@@ -21,6 +21,8 @@ pub enum Stream {
     Preview,
     /// `gnss`: recorded or GNSS poses.
     Gnss,
+    /// `imu`: speed and yaw rate that the vehicle measures itself.
+    Imu,
     /// `camera/<k>`: images of camera `k`.
     Camera(u8),
     /// `radar`: radar sweeps.
@@ -48,6 +50,7 @@ impl Stream {
         Some(match self {
             Self::Lidar | Self::Preview => Kind::Lidar,
             Self::Gnss => Kind::Gnss,
+            Self::Imu => Kind::Imu,
             Self::Radar => Kind::Radar,
             Self::Pose => Kind::Pose,
             Self::Bev => Kind::Bev,
@@ -64,7 +67,7 @@ impl Stream {
     #[must_use]
     pub fn most_bytes(self) -> Option<usize> {
         match self {
-            Self::Pose | Self::Gnss => Some(16 << 10),
+            Self::Pose | Self::Gnss | Self::Imu => Some(16 << 10),
             Self::Preview => Some(64 << 10),
             Self::Descriptor | Self::Boxes | Self::Detections => Some(4 << 20),
             Self::Lidar | Self::Camera(_) | Self::Radar | Self::Bev | Self::Points | Self::DetectionsJson => None,
@@ -77,6 +80,7 @@ impl Stream {
             ["lidar"] => Self::Lidar,
             ["@preview"] => Self::Preview,
             ["gnss"] => Self::Gnss,
+            ["imu"] => Self::Imu,
             ["camera", index] => Self::Camera(camera_index(index)?),
             ["radar"] => Self::Radar,
             ["pose"] => Self::Pose,
@@ -103,6 +107,7 @@ impl fmt::Display for Stream {
             Self::Lidar => f.write_str("lidar"),
             Self::Preview => f.write_str("@preview"),
             Self::Gnss => f.write_str("gnss"),
+            Self::Imu => f.write_str("imu"),
             Self::Camera(index) => write!(f, "camera/{index}"),
             Self::Radar => f.write_str("radar"),
             Self::Pose => f.write_str("pose"),

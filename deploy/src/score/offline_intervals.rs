@@ -69,7 +69,10 @@ pub fn concerns(offline: &BTreeSet<String>, account: &Account) -> bool {
     let replay = Role::Replay.to_string();
     let agent = |cav| process_id(Role::Agent, cav).to_string();
     let mut concerned: Vec<String> = match &account.topic {
-        Topic::Stream { stream: Stream::Lidar | Stream::Gnss | Stream::Radar | Stream::Camera(_), .. }
+        Topic::Stream {
+            stream: Stream::Lidar | Stream::Gnss | Stream::Imu | Stream::Radar | Stream::Camera(_),
+            ..
+        }
         | Topic::Truth => {
             vec![replay]
         }

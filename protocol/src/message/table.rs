@@ -5,7 +5,8 @@ use std::fmt;
 use serde::{Deserialize, Serialize};
 
 use super::{
-    Bev, Boxes, Control, Descriptor, Detections, Gnss, Lidar, Payload, Points, PoseEstimate, Radar, Stats, Truth,
+    Bev, Boxes, Control, Descriptor, Detections, EgoMotion, Gnss, Lidar, Payload, Points, PoseEstimate, Radar, Stats,
+    Truth,
 };
 use crate::WireError;
 
@@ -110,6 +111,8 @@ messages! {
     11 => Control(Control) = "control",
     /// Message counters and stage timings, any process to the operator.
     12 => Stats(Stats) = "stats",
+    /// Speed and yaw rate that a vehicle measures itself, replay to agent.
+    13 => Imu(EgoMotion) = "imu",
 }
 
 #[cfg(test)]

@@ -49,9 +49,11 @@ pub trait PoseSource: std::fmt::Debug + Send {
     /// The pose of one sweep with its confidence, or the reason why there is none.
     fn estimate(&mut self, input: &PoseInput<'_>) -> PoseEstimate;
 
-    /// Second step of a sweep, after its pose and its feature map were published: measures for later sweeps.
-    fn observe(&mut self, input: &PoseInput<'_>) {
+    /// Second step of a sweep, after its pose and its feature map were published: measures for later sweeps. True if
+    /// the sweep was measured.
+    fn observe(&mut self, input: &PoseInput<'_>) -> bool {
         let _ = input;
+        false
     }
 
     /// Durations of the stages of the last step, for sources that compute.

@@ -199,14 +199,14 @@ impl PoseSource for TrackedPose {
         }
     }
 
-    fn observe(&mut self, input: &PoseInput<'_>) {
-        self.times.clear();
+    fn observe(&mut self, input: &PoseInput<'_>) -> bool {
         let is_measured = self.measured_nanos == Some(input.capture_nanos);
-        let Some(state) = self.tracker.state().filter(|_| !is_measured && self.is_due()) else { return };
+        let Some(state) = self.tracker.state().filter(|_| !is_measured && self.is_due()) else { return false };
         let predicted = (!self.is_global_due(input.capture_nanos)).then_some(&state);
         if let Some(localization) = self.measure(input, predicted) {
             self.correct(input.capture_nanos, &localization);
         }
+        true
     }
 
     fn stages(&self) -> &[StageTiming] {
@@ -225,5 +225,122 @@ fn published(state: &TrackedState) -> PoseEstimate {
         world_from_cav: state.world_from_lidar.into(),
         confidence: 1.0 / (1.0 + xx_m2 + yy_m2),
         covariance: Some(state.covariance),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+    use std::sync::atomic::{AtomicU64, Ordering};
+
+    use nalgebra::Isometry3;
+    use protocol::{CavId, EgoMotion, PointCloud, Pose};
+
+    use super::*;
+    use crate::pgc::LocalizerTimes;
+
+    /// A vehicle that drives at 10 m/s along x; every sweep holds its number of points.
+    #[derive(Debug, Default)]
+    struct Road {
+        globals: Arc<AtomicU64>,
+        nears: Arc<AtomicU64>,
+        /// Sweeps from this one on are elsewhere.
+        carried_at: usize,
+        /// Sweeps without a pose.
+        blind: std::ops::Range<usize>,
+    }
+
+    impl Road {
+        fn result(&self, cloud: &PointCloud) -> Localization {
+            let sweep = cloud.xyzi.len();
+            let aside = if sweep >= self.carried_at { 300.0 } else { 0.0 };
+            let pose = Pose::from_xyz_yaw([sweep as f64, aside, 2.0], 0.0);
+            let none = PoseEstimate::NoPose { reason: NoPoseReason::TooFewInliers, inlier_count: 3 };
+            let estimate = if self.blind.contains(&sweep) { none } else { PoseEstimate::new(pose, 0.99) };
+            Localization::told(estimate, LocalizerTimes::default())
+        }
+    }
+
+    impl Localize for Road {
+        fn localize(&mut self, cloud: &PointCloud) -> Result<Localization, LocalizerError> {
+            self.globals.fetch_add(1, Ordering::Relaxed);
+            Ok(self.result(cloud))
+        }
+
+        fn localize_near(&mut self, cloud: &PointCloud, _: &Isometry3<f64>) -> Result<Localization, LocalizerError> {
+            self.nears.fetch_add(1, Ordering::Relaxed);
+            Ok(self.result(cloud))
+        }
+    }
+
+    /// Poses of sweeps, and the numbers of measurements by the whole localizer and near the prediction.
+    fn drive(road: Road, config: TrackedPoseConfig, sweeps: usize) -> (Vec<PoseEstimate>, [u64; 2]) {
+        let (globals, nears) = (Arc::clone(&road.globals), Arc::clone(&road.nears));
+        let mut source = TrackedPose::new(Box::new(road), config);
+        let cav = CavId::new("7").unwrap();
+        let estimates = (0..sweeps).map(|sweep| {
+            let cloud = PointCloud { xyzi: vec![[0.0; 4]; sweep] };
+            let capture_nanos = sweep as u64 * 100_000_000;
+            let motion = EgoMotion { speed_mps: Some(10.0), yaw_rate_rad_s: None };
+            let input = PoseInput { cav: &cav, capture_nanos, cloud: &cloud, measured: None, motion };
+            let estimate = source.estimate(&input);
+            source.observe(&input);
+            estimate
+        });
+        (estimates.collect(), [globals.load(Ordering::Relaxed), nears.load(Ordering::Relaxed)])
+    }
+
+    fn road() -> Road {
+        Road { carried_at: usize::MAX, ..Road::default() }
+    }
+
+    fn x_y(estimate: &PoseEstimate) -> [f64; 2] {
+        let [x, y, _] = estimate.world_from_cav().unwrap().translation_m;
+        [x, y]
+    }
+
+    #[test]
+    fn every_second_sweep_is_measured_and_each_has_a_pose() {
+        let (estimates, [globals, nears]) = drive(road(), TrackedPoseConfig::default(), 41);
+        for (sweep, estimate) in estimates.iter().enumerate() {
+            let [x, y] = x_y(estimate);
+            assert!((x - sweep as f64).abs() < 0.2 && y.abs() < 0.1, "sweep {sweep}: {x}, {y}");
+        }
+        // Four seconds: one at the start and one every two seconds.
+        assert_eq!((globals, globals + nears), (3, 21));
+        assert!(estimates.iter().all(|estimate| estimate.covariance().is_some() && estimate.confidence() > 0.9));
+    }
+
+    #[test]
+    fn vehicles_of_other_phases_measure_other_sweeps() {
+        let (_, [globals, nears]) = drive(road(), TrackedPoseConfig { phase: 1, ..Default::default() }, 41);
+        assert_eq!(globals + nears, 21, "the first sweep, and then those of odd numbers");
+    }
+
+    #[test]
+    fn a_carried_vehicle_is_noticed_at_once_and_found_within_a_second() {
+        let (estimates, _) = drive(Road { carried_at: 20, ..road() }, TrackedPoseConfig::default(), 40);
+        assert!(estimates[22].confidence() < 0.01, "{:?}", estimates[22]);
+        let found = estimates.iter().skip(20).position(|estimate| x_y(estimate)[1] > 299.0).unwrap();
+        assert!(found <= 10, "{found} sweeps");
+    }
+
+    #[test]
+    fn sweeps_without_a_measurement_are_predicted_for_a_while_and_then_have_none() {
+        let (estimates, _) = drive(Road { blind: 20..80, ..road() }, TrackedPoseConfig::default(), 90);
+        let without: Vec<usize> = (0..90).filter(|&sweep| estimates[sweep].world_from_cav().is_none()).collect();
+        let (first, last) = (without[0], without[without.len() - 1]);
+        assert!((25..=50).contains(&first) && last == 79, "{first}, {last}");
+        let lost = PoseEstimate::NoPose { reason: NoPoseReason::TooFewInliers, inlier_count: 3 };
+        assert_eq!(estimates[first], lost);
+        let confidence: Vec<f32> = estimates[21..first].iter().map(PoseEstimate::confidence).collect();
+        assert!(confidence.windows(2).all(|pair| pair[1] < pair[0]), "{confidence:?}");
+    }
+
+    #[test]
+    fn settings_out_of_range_are_named() {
+        let refused = |config: TrackedPoseConfig| config.validate().unwrap_err().to_string();
+        assert!(refused(TrackedPoseConfig { measure_every: 0, ..Default::default() }).contains("measure_every is 0"));
+        assert!(refused(TrackedPoseConfig { max_coast_s: -1.0, ..Default::default() }).contains("max_coast_s"));
     }
 }
