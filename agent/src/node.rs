@@ -185,7 +185,7 @@ impl<'a> Node<'a> {
         if arrival.topic == self.lidar {
             let superseded = self.pairing.add_sweep(capture_nanos, arrival, Instant::now());
             if superseded.is_some() {
-                self.bus.books().dropped(&self.lidar, DropReason::Superseded);
+                self.bus.stats().dropped(&self.lidar, DropReason::Superseded);
             }
         } else if arrival.topic == self.imu {
             if let Some(motion) = self.inbox.decode(&arrival, &self.options.limits) {
@@ -201,7 +201,7 @@ impl<'a> Node<'a> {
     /// Counts measurements whose sweeps were superseded, and they with them.
     fn count_unused(&self, unused: Unused) {
         for (topic, count) in [(&self.gnss, unused.poses), (&self.imu, unused.motions)] {
-            (0..count).for_each(|_| self.bus.books().dropped(topic, DropReason::Superseded));
+            (0..count).for_each(|_| self.bus.stats().dropped(topic, DropReason::Superseded));
         }
     }
 
@@ -209,11 +209,11 @@ impl<'a> Node<'a> {
         while let Some(PairedSweep { capture_nanos, sweep, pose, motion, unused }) = self.pairing.next(now) {
             self.count_unused(unused);
             let used = [(&self.gnss, pose.is_some()), (&self.imu, motion.is_some())];
-            used.iter().filter(|(_, is_used)| *is_used).for_each(|(topic, _)| self.bus.books().received(topic));
+            used.iter().filter(|(_, is_used)| *is_used).for_each(|(topic, _)| self.bus.stats().received(topic));
             let transport = unix_nanos().saturating_sub(sweep.header.stamp.publish_nanos);
             let Some(Lidar { points }) = self.inbox.decode(&sweep, &self.options.limits) else { continue };
-            self.bus.books().timed("lidar transport", Duration::from_nanos(transport));
-            self.bus.books().received(&self.lidar);
+            self.bus.stats().timed("lidar transport", Duration::from_nanos(transport));
+            self.bus.stats().received(&self.lidar);
             let arrived_nanos = unix_nanos().saturating_sub(nanos::of(sweep.at.elapsed()));
             self.process(&AgentInput {
                 capture_nanos,
@@ -230,25 +230,25 @@ impl<'a> Node<'a> {
     }
 
     fn process(&mut self, input: &AgentInput<'_>) {
-        let books = self.bus.books();
+        let stats = self.bus.stats();
         let began = Instant::now();
         let pose = self.filter.pose(self.agent.estimate_pose(input));
-        books.timed("pose", began.elapsed());
-        self.publishers.pose.offer(input.capture_nanos, pose);
+        stats.timed("pose", began.elapsed());
+        self.publishers.pose.submit(input.capture_nanos, pose);
         self.time_pose_stages();
         self.report.no_pose += u64::from(pose.world_from_cav().is_none());
         self.report.pose_jumps = self.agent.pose_jumps();
         match self.agent.perceive(input.cloud) {
             Ok(perception) => {
                 for stage in &perception.times {
-                    books.timed(&stage.stage, Duration::from_nanos(stage.nanos));
+                    stats.timed(&stage.stage, Duration::from_nanos(stage.nanos));
                 }
-                books.timed("agent", began.elapsed());
+                stats.timed("agent", began.elapsed());
                 self.report.sweeps += 1;
                 let perception = self.filter.perception(perception);
                 let shared = self.publishers.points.is_some().then(|| self.agent.share_points(input.cloud));
                 let shared = shared.map(|points| self.filter.points(points));
-                self.publishers.offer(input, pose, perception, shared, books);
+                self.publishers.submit(input, pose, perception, shared, stats);
                 self.observe(input);
             }
             Err(error) => {
@@ -265,13 +265,13 @@ impl Node<'_> {
         let began = Instant::now();
         if self.agent.observe(input) {
             self.time_pose_stages();
-            self.bus.books().timed("pose measurement", began.elapsed());
+            self.bus.stats().timed("pose measurement", began.elapsed());
         }
     }
 
     fn time_pose_stages(&self) {
         for stage in self.agent.pose_stages() {
-            self.bus.books().timed(&stage.stage, Duration::from_nanos(stage.nanos));
+            self.bus.stats().timed(&stage.stage, Duration::from_nanos(stage.nanos));
         }
     }
 }
@@ -324,40 +324,40 @@ impl Publishers {
         let now = Instant::now();
         if now >= self.next_descriptor {
             self.next_descriptor = now + DESCRIPTOR_PERIOD;
-            self.descriptor.offer(0, self.description.clone());
+            self.descriptor.submit(0, self.description.clone());
         }
     }
 
-    fn offer(
+    fn submit(
         &mut self,
         input: &AgentInput<'_>,
         pose: PoseEstimate,
         perception: Perception,
         shared: Option<PointCloud>,
-        books: &MessageStats,
+        stats: &MessageStats,
     ) {
         let Perception { features, confidence, detections, .. } = perception;
         if let Some(bev) = &self.bev {
-            let (codec, rate, books, topic) = (self.codec, Arc::clone(&self.rate), books.clone(), bev.topic().clone());
-            let (number, offered, capture_nanos) = (self.submitted, Instant::now(), input.capture_nanos);
+            let (codec, rate, stats, topic) = (self.codec, Arc::clone(&self.rate), stats.clone(), bev.topic().clone());
+            let (number, submitted, capture_nanos) = (self.submitted, Instant::now(), input.capture_nanos);
             self.submitted += 1;
             // The choice of format, selection, quantisation and compression run on the sending thread, at the map's
             // turn.
-            bev.offer_encoded(capture_nanos, move |stamp| {
-                let turn = Turn { number, offered, begun: Instant::now() };
+            bev.submit_encoded(capture_nanos, move |stamp| {
+                let turn = Turn { number, submitted, begun: Instant::now() };
                 let mut rate = rate.lock().unwrap_or_else(PoisonError::into_inner);
                 let features = rate.encode(features, &codec, &confidence, capture_nanos, Some(&turn))?;
                 if let Some(choice) = features.rate {
-                    books.adapted(&topic, choice.reason);
+                    stats.adapted(&topic, choice.reason);
                 }
                 wire::encode(stamp, Bev { pose, features })
             });
         }
         if let Some(boxes) = &self.boxes {
-            boxes.offer(input.capture_nanos, Boxes { pose, detections });
+            boxes.submit(input.capture_nanos, Boxes { pose, detections });
         }
         if let (Some(points), Some(shared)) = (&self.points, shared) {
-            points.offer(input.capture_nanos, Points { pose, points: shared });
+            points.submit(input.capture_nanos, Points { pose, points: shared });
         }
     }
 

@@ -38,7 +38,7 @@ const RECORDER_SHARE: Duration = Duration::from_millis(800);
 
 /// Settings of a run beside its scenario.
 #[derive(Debug, Clone)]
-pub struct UpOptions {
+pub struct RunOptions {
     /// Folder of the run folders.
     pub runs: PathBuf,
     /// Folder of the programs `agent`, `ego-fuser` and `sim-replay`.
@@ -89,9 +89,9 @@ impl RunResult {
 ///
 /// # Errors
 /// [`RunError`] when the run cannot start, or a process stays down.
-pub fn up(scenario: &Scenario, options: &UpOptions) -> Result<RunResult, RunError> {
+pub fn run_scenario(scenario: &Scenario, options: &RunOptions) -> Result<RunResult, RunError> {
     if scenario.clock == Clock::Stepped {
-        return crate::run::stepped::up(scenario, options);
+        return crate::run::stepped::run_scenario(scenario, options);
     }
     let fleet = Fleet::plan(scenario)?;
     let run = fleet.scenario.run.clone().unwrap_or_else(|| name_of_now(options.prefix));
@@ -104,7 +104,7 @@ pub fn up(scenario: &Scenario, options: &UpOptions) -> Result<RunResult, RunErro
 }
 
 /// Runs a fleet under the given run name in the given folder.
-fn go(fleet: &Fleet, options: &UpOptions, run: &RunId, folder: &RunFolder) -> Result<RunResult, RunError> {
+fn go(fleet: &Fleet, options: &RunOptions, run: &RunId, folder: &RunFolder) -> Result<RunResult, RunError> {
     let stop = Stop::new();
     stop.on_signals().map_err(RunError::Signals)?;
     let fingerprint = fingerprint(fleet, &options.programs);
@@ -176,11 +176,15 @@ fn watch(
     let mut display = Display::new(fleet.ticks);
     for ProcessSpec { name, metrics, .. } in &specs {
         if let Some(address) = metrics {
-            display.say(&format!("metrics of {name} at http://{address}/metrics"));
+            display.print_line(&format!("metrics of {name} at http://{address}/metrics"));
         }
     }
     let restarts = fleet.scenario.timeouts.restarts;
-    display.say(&format!("run {run} at {endpoint}: {} processes, logs in {}", specs.len(), folder.log_dir().display()));
+    display.print_line(&format!(
+        "run {run} at {endpoint}: {} processes, logs in {}",
+        specs.len(),
+        folder.log_dir().display()
+    ));
     let mut supervisor = Supervisor::start(specs, &folder.log_dir(), restarts, &events)?;
     let mut watch = StatusReporter::new(fleet, run, endpoint, folder);
     let ending = watch.follow(&supervisor, &happened, scorer, stop, &mut display);
@@ -261,7 +265,7 @@ fn write(
     watched: &Watched,
     fingerprint: JoinHandle<std::io::Result<Provenance>>,
 ) -> RunResult {
-    let Scored { board, books, progress, unwritten: lines } = scored;
+    let Scored { board, stats, progress, unwritten: lines } = scored;
     let mut unwritten = Vec::new();
     if lines > 0 {
         unwritten.push(format!("{lines} results are missing in {}", folder.file("detections.jsonl").display()));
@@ -272,7 +276,7 @@ fn write(
         }
     };
     let mut sum = Ledger::default();
-    for process in &books {
+    for process in &stats {
         sum.merge(&process.ledger);
     }
     let exempted = sum.exempt(|account| offline_intervals::concerns(&watched.offline, account));
@@ -280,7 +284,7 @@ fn write(
     let metrics = metrics(fleet, &board, &progress, &sum);
     note(folder.write_json("metrics.json", &metrics));
     note(folder.write_frames(board.records(), &swept(&folder.file(SWEEP_LOG))));
-    let report = LedgerReport::new(&books, &sum, &balance, (&watched.offline, exempted)).with_refused(refused);
+    let report = LedgerReport::new(&stats, &sum, &balance, (&watched.offline, exempted)).with_refused(refused);
     note(folder.write_json("ledger.json", &report));
     let provenance = match fingerprint.join() {
         Ok(Ok(provenance)) => Some(provenance),

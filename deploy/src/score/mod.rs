@@ -17,6 +17,6 @@ mod true_boxes;
 pub use frame_record::{FrameRecord, JudgedFrame};
 pub use frame_scores::FrameScores;
 pub use neighbours::NeighbourRecord;
-pub use node::{ProcessBooks, Progress, Scored, ScorerError, ScorerNode, scorer_cav};
+pub use node::{ProcessStats, Progress, Scored, ScorerError, ScorerNode, scorer_cav};
 pub use stage_stamps::StageStamps;
 pub use true_boxes::true_boxes;

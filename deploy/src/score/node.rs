@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use bus::bounded_queue::Pop;
 use bus::{Arrival, Bus, BusError, Event, Identity, Inbox, LivelinessToken, Subscription, process_id};
 use protocol::{
-    CavId, Detections, DetectionsReport, HeardNeighbour, KeyExpr, Ledger, Limits, PoseEstimate, ProcessId, Role, RunId,
+    CavId, Detections, DetectionsReport, KeyExpr, Ledger, Limits, NeighbourState, PoseEstimate, ProcessId, Role, RunId,
     StageSummary, Stats, Stream, Topic, Truth,
 };
 use zenoh::Session;
@@ -40,7 +40,7 @@ pub struct Progress {
     /// Number of neighbours in the last result.
     pub fused: usize,
     /// Neighbours whose messages the ego received for the last result, and its judgement of each.
-    pub heard: Vec<HeardNeighbour>,
+    pub neighbours: Vec<NeighbourState>,
     /// Bytes of all fused messages so far.
     pub wire_bytes: u64,
     /// Number of messages dropped so far, by all processes.
@@ -48,7 +48,7 @@ pub struct Progress {
     /// True once the replay has announced the end of the scene.
     pub ended: bool,
     /// Time of the last report of each process, by name.
-    pub told: BTreeMap<String, Instant>,
+    pub last_reports: BTreeMap<String, Instant>,
 }
 
 impl Progress {
@@ -63,7 +63,7 @@ impl Progress {
 
 /// Ledger of one process instance.
 #[derive(Debug, Clone)]
-pub struct ProcessBooks {
+pub struct ProcessStats {
     /// Name of the process.
     pub process: ProcessId,
     /// Its message counters.
@@ -76,14 +76,14 @@ pub struct ProcessBooks {
 const MAX_INSTANCES: usize = 1024;
 
 /// Last ledger of every process and epoch.
-type ScoreStats = BTreeMap<(ProcessId, u64), ProcessBooks>;
+type ScoreStats = BTreeMap<(ProcessId, u64), ProcessStats>;
 
 /// Results of the scorer at the end.
 pub struct Scored {
     /// Detections against the truth.
     pub board: FrameScores,
     /// Last report of every process instance.
-    pub books: Vec<ProcessBooks>,
+    pub stats: Vec<ProcessStats>,
     /// Progress of the run.
     pub progress: Progress,
     /// Number of results that are not in the file, for lack of disk space.
@@ -151,9 +151,9 @@ impl ScorerNode {
         let progress = Arc::<Mutex<Progress>>::default();
         let worker = Worker {
             inbox: Arc::clone(&inbox),
-            bus_stats: bus.books().clone(),
+            bus_stats: bus.stats().clone(),
             board,
-            books: BTreeMap::new(),
+            stats: BTreeMap::new(),
             progress: Arc::clone(&progress),
             detections,
             numbered: NumberedResults::default(),
@@ -192,11 +192,11 @@ impl ScorerNode {
     #[must_use]
     pub fn finish(self) -> Scored {
         self.inbox.close();
-        let (board, books, unwritten) = self.thread.join().expect("the scorer's thread has no reason to panic");
-        let own = ProcessBooks {
+        let (board, stats, unwritten) = self.thread.join().expect("the scorer's thread has no reason to panic");
+        let own = ProcessStats {
             process: self.bus.identity().process.clone(),
-            ledger: self.bus.books().ledger(),
-            stages: self.bus.books().stages(),
+            ledger: self.bus.stats().ledger(),
+            stages: self.bus.stats().stages(),
         };
         let progress = self.progress.lock().unwrap_or_else(PoisonError::into_inner).clone();
         drop((self._subscriptions, self._presence, self.offline));
@@ -204,8 +204,8 @@ impl ScorerNode {
             tracing::warn!("{overdue}");
         }
         // The scorer receives its own reports like those of others; its current counters are newer.
-        let others = books.into_values().filter(|books| books.process != own.process);
-        Scored { board, books: others.chain([own.clone()]).collect(), progress, unwritten }
+        let others = stats.into_values().filter(|stats| stats.process != own.process);
+        Scored { board, stats: others.chain([own.clone()]).collect(), progress, unwritten }
     }
 }
 
@@ -223,7 +223,7 @@ struct Worker {
     inbox: Arc<Inbox>,
     bus_stats: bus::MessageStats,
     board: FrameScores,
-    books: ScoreStats,
+    stats: ScoreStats,
     progress: Arc<Mutex<Progress>>,
     detections: ResultLines,
     numbered: NumberedResults,
@@ -243,7 +243,7 @@ impl Worker {
         }
         self.write_results(true);
         self.board.close();
-        (self.board, self.books, self.detections.finish())
+        (self.board, self.stats, self.detections.finish())
     }
 
     fn take(&mut self, topic: &Topic, arrival: &Arrival) {
@@ -281,7 +281,7 @@ impl Worker {
         self.write_results(false);
         let began = self.published.get(&stamp.capture_nanos);
         let latency_ms = began.map(|began| (stamp.publish_nanos as f64 - *began as f64) / 1e6);
-        let heard = result.heard.clone();
+        let neighbours = result.neighbours.clone();
         let (fused, bytes) =
             (result.fused.len(), result.fused.iter().map(|neighbour| neighbour.wire_bytes).sum::<u64>());
         let at = arrival.at;
@@ -290,7 +290,7 @@ impl Worker {
             progress.span = Some((progress.span.map_or(at, |(first, _)| first), at));
             progress.latency_ms = latency_ms;
             progress.fused = fused;
-            progress.heard = heard;
+            progress.neighbours = neighbours;
             progress.wire_bytes += bytes;
         });
         self.board.result(stamp, result);
@@ -314,16 +314,16 @@ impl Worker {
         let Some(Stats { process, ledger, stages }) = self.inbox.decode(arrival, &Limits::DEFAULT) else { return };
         // A restarted process has another epoch: both instances count.
         let instance = (process.clone(), arrival.header.stamp.epoch);
-        let has_room = self.books.len() < MAX_INSTANCES || self.books.contains_key(&instance);
+        let has_room = self.stats.len() < MAX_INSTANCES || self.stats.contains_key(&instance);
         if process != *sender || !has_room {
             return tracing::warn!(%sender, %process, "report with another process's name, or of too many processes: ignored");
         }
         let (name, at) = (process.to_string(), arrival.at);
-        self.books.insert(instance, ProcessBooks { process, ledger, stages });
-        let dropped = self.books.values().map(|books| books.ledger.total().dropped_total()).sum();
+        self.stats.insert(instance, ProcessStats { process, ledger, stages });
+        let dropped = self.stats.values().map(|stats| stats.ledger.total().dropped_total()).sum();
         self.note(|progress| {
             progress.dropped = dropped;
-            progress.told.insert(name, at);
+            progress.last_reports.insert(name, at);
         });
     }
 

@@ -59,7 +59,7 @@ pub use passive_subscriber::{PassiveSubscriber, RawMessage};
 pub use process_config::{Configured, ProcessConfig, minimal};
 pub use publisher::{Overflow, Publisher, PublisherOptions, unix_nanos};
 pub use readiness::{Barrier, NotReady, Route, RouteError, RoutesReady, process_id};
-pub use rejection_log::{Rejection, RejectionLog, STRANGER};
+pub use rejection_log::{Rejection, RejectionLog, UNAUTHORISED};
 pub use session::{BusOptions, Role as SessionRole, open};
 pub use subscriber::{Arrival, Event, Inbox, Subscription};
 pub use watchdog::Heartbeat;

@@ -143,7 +143,7 @@ mod tests {
         stats.received(&lidar);
         stats.received(&lidar);
         stats.dropped(&lidar, DropReason::Superseded);
-        stats.offered(&bev);
+        stats.submitted(&bev);
         stats.trusted(&cav, 0.25);
         for milliseconds in [0.2, 3.0, 4.0, 40.0, 9_000.0] {
             stats.timed("encode \"x\"", Duration::from_secs_f64(milliseconds / 1e3));

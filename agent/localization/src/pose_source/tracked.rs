@@ -257,7 +257,7 @@ mod tests {
             let pose = Pose::from_xyz_yaw([sweep as f64, aside, 2.0], 0.0);
             let none = PoseEstimate::NoPose { reason: NoPoseReason::TooFewInliers, inlier_count: 3 };
             let estimate = if self.blind.contains(&sweep) { none } else { PoseEstimate::new(pose, 0.99) };
-            Localization::told(estimate, LocalizerTimes::default())
+            Localization::from_estimate(estimate, LocalizerTimes::default())
         }
     }
 
