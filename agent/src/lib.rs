@@ -14,3 +14,4 @@ pub mod output_filter;
 pub mod rate;
 pub mod sweep_log;
 pub mod sweep_pairing;
+pub mod sweep_selection;

@@ -12,7 +12,9 @@ use bus::shutdown::Stop;
 use bus::{Arrival, Bus, BusError, Event, Inbox, MessageStats, Publisher, PublisherOptions, Subscription, unix_nanos};
 use protocol::codec::CodecConfig;
 use protocol::message::{Bev, Boxes, Descriptor, Points};
-use protocol::{DropReason, Dtype, Gnss, Lidar, Limits, PointCloud, PoseEstimate, Role, Stream, Topic, wire};
+use protocol::{
+    DropReason, Dtype, Gnss, KeyExpr, Lidar, Limits, Pace, PointCloud, PoseEstimate, Role, Stream, Topic, wire,
+};
 use support::nanos;
 
 use crate::agent::{Agent, AgentInput, Perception};
@@ -20,6 +22,7 @@ use crate::output_filter::{OutputFilter, Unfiltered};
 use crate::rate::{RateConfig, RateControl, Turn};
 use crate::sweep_log::SweepLog;
 use crate::sweep_pairing::{PairedSweep, SweepPairing, Unused};
+use crate::sweep_selection::{MAX_EGOS, SweepSelection};
 
 /// Longest time that a sweep waits for its pose, which was sent before it.
 const POSE_TIMEOUT: Duration = Duration::from_millis(200);
@@ -110,10 +113,11 @@ struct Node<'a> {
     gnss: Topic,
     imu: Topic,
     pairing: SweepPairing<Arrival>,
+    selection: SweepSelection,
     publishers: Publishers,
     report: NodeReport,
     sweep_log: Option<SweepLog>,
-    _subscriptions: [Subscription; 3],
+    _subscriptions: [Subscription; 4],
 }
 
 impl<'a> Node<'a> {
@@ -127,7 +131,7 @@ impl<'a> Node<'a> {
         let topic = |stream| Topic::Stream { cav: agent.cav().clone(), stream };
         let (lidar, gnss, imu) = (topic(Stream::Lidar), topic(Stream::Gnss), topic(Stream::Imu));
         // One slot: while a sweep is computed only the newest of those that arrive is kept.
-        let inbox = bus.inbox(1, 3);
+        let inbox = bus.inbox(1, 3 + MAX_EGOS);
         stop.on_request({
             let inbox = Arc::clone(&inbox);
             move || inbox.close()
@@ -137,6 +141,7 @@ impl<'a> Node<'a> {
             bus.subscribe_keeping(gnss.clone(), POSE_SLOTS, &inbox)?,
             bus.subscribe_keeping(imu.clone(), POSE_SLOTS, &inbox)?,
             bus.subscribe(lidar.clone(), &inbox)?,
+            bus.subscribe_all(&KeyExpr::stream(&bus.identity().run, Stream::Pace), &inbox)?,
         ];
         let pairing = SweepPairing::new(POSE_TIMEOUT);
         let sweep_log = options.sweep_log.as_deref().map(SweepLog::open).transpose();
@@ -154,6 +159,7 @@ impl<'a> Node<'a> {
             gnss,
             imu,
             pairing,
+            selection: SweepSelection::default(),
             publishers,
             report: NodeReport::default(),
             sweep_log,
@@ -182,7 +188,14 @@ impl<'a> Node<'a> {
 
     fn admit(&mut self, arrival: Arrival) {
         let capture_nanos = arrival.header.stamp.capture_nanos;
-        if arrival.topic == self.lidar {
+        if let Topic::Stream { cav, stream: Stream::Pace } = &arrival.topic {
+            if let Some(pace) = self.inbox.decode::<Pace>(&arrival, &self.options.limits) {
+                self.selection.follow(cav, pace);
+                self.bus.stats().received(&arrival.topic);
+            }
+        } else if arrival.topic == self.lidar && !self.selection.admits(capture_nanos) {
+            self.bus.stats().dropped(&self.lidar, DropReason::Paced);
+        } else if arrival.topic == self.lidar {
             let superseded = self.pairing.add_sweep(capture_nanos, arrival, Instant::now());
             if superseded.is_some() {
                 self.bus.stats().dropped(&self.lidar, DropReason::Superseded);

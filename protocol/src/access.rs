@@ -87,7 +87,7 @@ impl Principal {
         let (publish, subscribe) = match self.role {
             Role::Agent => {
                 let sensors = SENSORS.into_iter().map(own).chain([keys(&format_args!("{}/camera/*", self.cav))]);
-                (SHARED.map(own).into(), sensors.collect())
+                (SHARED.map(own).into(), sensors.chain([everyones(&Stream::Pace)]).collect())
             }
             Role::Ego => {
                 let shared = SHARED.iter().flat_map(|stream| [everyones(stream), over_link(stream)]);
@@ -148,6 +148,7 @@ pub fn size_limits() -> Vec<(Vec<KeyExpr>, usize)> {
         Stream::Pose,
         Stream::Gnss,
         Stream::Imu,
+        Stream::Pace,
         Stream::Preview,
         Stream::Descriptor,
         Stream::Boxes,
@@ -166,7 +167,7 @@ const SENSORS: [Stream; 4] = [Stream::Lidar, Stream::Gnss, Stream::Imu, Stream::
 /// Streams of agents.
 const SHARED: [Stream; 5] = [Stream::Pose, Stream::Bev, Stream::Boxes, Stream::Points, Stream::Descriptor];
 /// Streams of an ego for all principals.
-const DETECTIONS: [Stream; 2] = [Stream::Detections, Stream::DetectionsJson];
+const DETECTIONS: [Stream; 3] = [Stream::Detections, Stream::DetectionsJson, Stream::Pace];
 
 impl fmt::Display for Principal {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {

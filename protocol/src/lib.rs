@@ -120,7 +120,7 @@ pub use ledger::{Account, Counts, Ledger};
 pub use limits::Limits;
 pub use message::{
     AgentTruth, Bev, Boxes, Control, Descriptor, Detections, DetectionsReport, EgoMotion, FusedNeighbour, Gnss,
-    GnssSource, Kind, Lidar, Message, ModelHash, NeighbourState, NoPoseReason, Payload, PlanarCovariance, Points,
+    GnssSource, Kind, Lidar, Message, ModelHash, NeighbourState, NoPoseReason, Pace, Payload, PlanarCovariance, Points,
     PoseEstimate, Radar, SkippedNeighbour, StageSummary, StageTiming, Stats, TopicCount, TrueObject, Truth,
 };
 pub use misbehaviour_reason::MisbehaviourReason;

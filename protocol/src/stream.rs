@@ -35,6 +35,8 @@ pub enum Stream {
     Boxes,
     /// `points`: raw points, for the early-fusion baseline only.
     Points,
+    /// `pace`: the sweeps that an ego has time for.
+    Pace,
     /// `descriptor`: model and streams of the vehicle.
     Descriptor,
     /// `detections`: detections of an ego.
@@ -56,6 +58,7 @@ impl Stream {
             Self::Bev => Kind::Bev,
             Self::Boxes => Kind::Boxes,
             Self::Points => Kind::Points,
+            Self::Pace => Kind::Pace,
             Self::Descriptor => Kind::Descriptor,
             Self::Detections => Kind::Detections,
             Self::Camera(_) | Self::DetectionsJson => return None,
@@ -67,7 +70,7 @@ impl Stream {
     #[must_use]
     pub fn most_bytes(self) -> Option<usize> {
         match self {
-            Self::Pose | Self::Gnss | Self::Imu => Some(16 << 10),
+            Self::Pose | Self::Gnss | Self::Imu | Self::Pace => Some(16 << 10),
             Self::Preview => Some(64 << 10),
             Self::Descriptor | Self::Boxes | Self::Detections => Some(4 << 20),
             Self::Lidar | Self::Camera(_) | Self::Radar | Self::Bev | Self::Points | Self::DetectionsJson => None,
@@ -87,6 +90,7 @@ impl Stream {
             ["bev"] => Self::Bev,
             ["boxes"] => Self::Boxes,
             ["points"] => Self::Points,
+            ["pace"] => Self::Pace,
             ["descriptor"] => Self::Descriptor,
             ["detections"] => Self::Detections,
             ["detections", "json"] => Self::DetectionsJson,
@@ -114,6 +118,7 @@ impl fmt::Display for Stream {
             Self::Bev => f.write_str("bev"),
             Self::Boxes => f.write_str("boxes"),
             Self::Points => f.write_str("points"),
+            Self::Pace => f.write_str("pace"),
             Self::Descriptor => f.write_str("descriptor"),
             Self::Detections => f.write_str("detections"),
             Self::DetectionsJson => f.write_str("detections/json"),

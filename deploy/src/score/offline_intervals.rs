@@ -76,7 +76,7 @@ pub fn concerns(offline: &BTreeSet<String>, account: &Account) -> bool {
         | Topic::Truth => {
             vec![replay]
         }
-        Topic::Stream { cav, stream: Stream::Detections | Stream::DetectionsJson } => {
+        Topic::Stream { cav, stream: Stream::Detections | Stream::DetectionsJson | Stream::Pace } => {
             vec![process_id(Role::Ego, cav).to_string()]
         }
         Topic::Stream { cav, .. } => vec![agent(cav)],

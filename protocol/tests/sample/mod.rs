@@ -151,6 +151,7 @@ pub(crate) fn every_kind() -> Vec<Message> {
         Message::Lidar(Lidar { points: points() }),
         Message::Lidar(Lidar::default()),
         Message::Radar(Radar { points: points() }),
+        Message::Pace(Pace { interval_nanos: 200_000_000, phase_nanos: 1_500_000_000 }),
         Message::Imu(EgoMotion { speed_mps: Some(8.25), yaw_rate_rad_s: None }),
         Message::Gnss(Gnss {
             world_from_lidar: pose_at([1.0, 2.0, 3.0]),

@@ -222,6 +222,17 @@ impl PoseSourceConfig {
         }
     }
 
+    /// The same for one vehicle of several on one machine: those that are tracked measure in turn.
+    #[must_use]
+    pub fn with_turn(self, turn: u32) -> Self {
+        match self {
+            Self::Tracked(config) => {
+                Self::Tracked(TrackedPoseConfig { phase: config.phase.saturating_add(turn), ..config })
+            }
+            other => other,
+        }
+    }
+
     /// Checks the values; files are not opened.
     ///
     /// # Errors

@@ -177,7 +177,7 @@ impl TrackedPose {
     fn is_due(&self) -> bool {
         let turn = self.sweeps + u64::from(self.config.measure_every) - 1;
         let phase = u64::from(self.config.phase);
-        self.tracker.is_contradicted() || (turn + phase).is_multiple_of(u64::from(self.config.measure_every))
+        self.tracker.needs_measurement() || (turn + phase).is_multiple_of(u64::from(self.config.measure_every))
     }
 
     /// True if the sweep is measured without the prediction.

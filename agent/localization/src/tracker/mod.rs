@@ -22,7 +22,9 @@ const MAX_SPEED_MPS: f64 = 50.0;
 /// Largest distance between two good poses of the same place, metres.
 const SLACK_M: f64 = 2.5;
 /// Standard deviation of a speed from two poses, metres per second.
-const SPEED_STD_MPS: f64 = 5.0;
+const SPEED_STD_MPS: f64 = 3.0;
+/// Longest time between two poses that a speed is computed from, seconds.
+const SPEED_BASE_S: f64 = 1.0;
 
 /// Limits after which a vehicle counts as lost.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -60,8 +62,8 @@ pub enum Correction {
 pub struct PoseTracker {
     limits: TrackerLimits,
     filter: Option<MotionFilter>,
-    /// Capture time of the last accepted measurement, nanoseconds.
-    accepted_nanos: u64,
+    /// Last accepted measurement.
+    accepted: Option<PoseMeasurement>,
     /// Rejected measurements in a row that can be reached from each other.
     rejected: Vec<PoseMeasurement>,
     /// Distance between the last rejected measurement and the prediction, metres.
@@ -72,7 +74,7 @@ impl PoseTracker {
     /// Tracker of a vehicle whose place is not known.
     #[must_use]
     pub fn new(limits: TrackerLimits) -> Self {
-        Self { limits, filter: None, accepted_nanos: 0, rejected: Vec::new(), contradiction_m: 0.0 }
+        Self { limits, filter: None, accepted: None, rejected: Vec::new(), contradiction_m: 0.0 }
     }
 
     /// Moves the state to the capture time of a sweep. `None`: the vehicle is lost, or the clock went back.
@@ -91,9 +93,10 @@ impl PoseTracker {
     }
 
     fn can_predict(&self, capture_nanos: u64) -> bool {
-        let since_s = seconds(self.accepted_nanos, capture_nanos);
+        let is_recent =
+            |accepted: &PoseMeasurement| seconds(accepted.capture_nanos, capture_nanos) <= self.limits.max_coast_s;
         let is_ahead = self.filter.as_ref().is_some_and(|filter| filter.capture_nanos <= capture_nanos);
-        is_ahead && since_s <= self.limits.max_coast_s
+        is_ahead && self.accepted.as_ref().is_some_and(is_recent)
     }
 
     /// Current state, if the vehicle is not lost.
@@ -124,7 +127,7 @@ impl PoseTracker {
         };
         if filter.capture_nanos == measurement.capture_nanos && filter.distance_squared(measurement) <= GATE {
             filter.correct(measurement);
-            self.accepted_nanos = measurement.capture_nanos;
+            self.accepted = Some(*measurement);
             self.rejected.clear();
             return Correction::Accepted;
         }
@@ -141,24 +144,26 @@ impl PoseTracker {
         if self.rejected.len() < AGREEING {
             return Correction::Rejected;
         }
-        let before = self.rejected[self.rejected.len() - 2];
+        self.accepted = self.rejected.iter().rev().nth(1).copied();
         self.start(measurement);
-        if let Some(filter) = &mut self.filter {
-            filter.set_speed(speed_mps(&before, measurement), SPEED_STD_MPS);
-        }
         Correction::Relocated
     }
 
+    /// Starts at a measurement; with the speed from the one before it, if that is recent.
     fn start(&mut self, measurement: &PoseMeasurement) {
-        self.filter = Some(MotionFilter::at(measurement));
-        self.accepted_nanos = measurement.capture_nanos;
+        let mut filter = MotionFilter::at(measurement);
+        let before = self.accepted.replace(*measurement);
+        if let Some(before) = before.filter(|before| can_follow(before, measurement)) {
+            filter.set_speed(speed_mps(&before, measurement), SPEED_STD_MPS);
+        }
+        self.filter = Some(filter);
         self.rejected.clear();
     }
 
-    /// Speed along the heading, metres per second; `None` if the vehicle is lost.
+    /// True if a measurement is needed now: the last one was rejected, or the speed is not known well.
     #[must_use]
-    pub fn speed_mps(&self) -> Option<f64> {
-        self.filter.as_ref().map(MotionFilter::speed_mps)
+    pub fn needs_measurement(&self) -> bool {
+        self.is_contradicted() || self.filter.as_ref().is_none_or(|filter| filter.speed_std_mps() > SPEED_STD_MPS)
     }
 }
 
@@ -171,7 +176,7 @@ fn seconds(from_nanos: u64, to_nanos: u64) -> f64 {
 fn can_follow(from: &PoseMeasurement, to: &PoseMeasurement) -> bool {
     let time_s = seconds(from.capture_nanos, to.capture_nanos);
     let off = to.world_from_lidar.translation.vector - from.world_from_lidar.translation.vector;
-    time_s > 0.0 && off.norm() <= SLACK_M + MAX_SPEED_MPS * time_s
+    time_s > 0.0 && time_s <= SPEED_BASE_S && off.norm() <= SLACK_M + MAX_SPEED_MPS * time_s
 }
 
 /// Speed along the heading from one pose to the next, metres per second.

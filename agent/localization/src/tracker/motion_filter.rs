@@ -159,9 +159,9 @@ impl MotionFilter {
         PlanarCovariance { xx_m2: entry(X, X), xy_m2: entry(X, Y), yy_m2: entry(Y, Y), yaw_rad2: entry(YAW, YAW) }
     }
 
-    /// Speed along the heading, metres per second.
-    pub(super) fn speed_mps(&self) -> f64 {
-        self.state[SPEED]
+    /// Standard deviation of the speed, metres per second.
+    pub(super) fn speed_std_mps(&self) -> f64 {
+        self.covariance[(SPEED, SPEED)].sqrt()
     }
 
     /// Measured minus expected pose (x, y in metres, yaw in radians), and its covariance.

@@ -61,7 +61,8 @@ fn predictions_are_about_as_good_as_measurements_and_stay_within_their_bounds() 
     let (mut errors, mut exceeded) = (Vec::new(), 0);
     for seed in 0..20 {
         let results = followed(&mut PoseTracker::new(LIMITS), 0..100, seed);
-        assert_eq!(results.len(), 99, "every sweep but the first has a prediction");
+        // One pose says nothing of the speed: the second measurement starts again, with it.
+        assert_eq!(results.len(), 98);
         let settled = &results[20..];
         errors.extend(settled.iter().map(|(error_m, _)| *error_m));
         exceeded += settled.iter().filter(|(error_m, bound_m)| error_m > bound_m).count();
