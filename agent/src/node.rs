@@ -94,6 +94,11 @@ pub fn run_filtered(
     options: &NodeOptions,
     stop: &Stop,
 ) -> Result<NodeReport, BusError> {
+    let mut agent = agent;
+    // The first sweep does not wait for the tensor library's preparations.
+    if let Err(error) = agent.perceive(&PointCloud::default()) {
+        tracing::warn!("the detector is not warmed up: {error}");
+    }
     let mut node = Node::open(bus, agent, filter, options, stop)?;
     let presence = bus.announce(Role::Agent)?;
     node.listen(stop);

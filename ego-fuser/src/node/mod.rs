@@ -111,6 +111,10 @@ pub struct NodeReport {
 /// # Errors
 /// [`BusError`] of the bus. Errors of single messages are counted and logged.
 pub fn run(bus: &Bus, cav: &CavId, ego: Ego, options: &NodeOptions, stop: &Stop) -> Result<NodeReport, BusError> {
+    let mut ego = ego;
+    if let Err(error) = ego.warm_up(cav) {
+        tracing::warn!("the networks are not warmed up: {error}");
+    }
     let mut node = Node::open(bus, cav, ego, options, stop)?;
     let presence = bus.announce(Role::Ego)?;
     node.receive(stop)?;
