@@ -124,13 +124,13 @@ impl Agent {
 
     /// Durations of the stages of the last pose, for pose sources that compute.
     #[must_use]
-    pub fn pose_stages(&self) -> &[StageTiming] {
+    pub(crate) fn pose_stages(&self) -> &[StageTiming] {
         self.pose_source.stages()
     }
 
     /// Number of poses so far that the vehicle cannot have reached from the previous ones.
     #[must_use]
-    pub fn pose_jumps(&self) -> u64 {
+    pub(crate) fn pose_jumps(&self) -> u64 {
         self.pose_source.jumps()
     }
 

@@ -11,32 +11,32 @@ const MAX_MEASUREMENTS: usize = 32;
 
 /// A sweep with its measurements, if they have arrived.
 #[derive(Debug, PartialEq)]
-pub struct PairedSweep<S> {
+pub(crate) struct PairedSweep<S> {
     /// Capture time, nanoseconds.
-    pub capture_nanos: u64,
+    pub(crate) capture_nanos: u64,
     /// The sweep.
-    pub sweep: S,
+    pub(crate) sweep: S,
     /// The pose measured at the same time.
-    pub pose: Option<Pose>,
+    pub(crate) pose: Option<Pose>,
     /// The motion measured at the same time.
-    pub motion: Option<EgoMotion>,
+    pub(crate) motion: Option<EgoMotion>,
     /// Poses and motions of earlier sweeps, which were superseded.
-    pub unused: Unused,
+    pub(crate) unused: Unused,
 }
 
 /// Numbers of measurements that no sweep used.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct Unused {
+pub(crate) struct Unused {
     /// Poses.
-    pub poses: usize,
+    pub(crate) poses: usize,
     /// Motions.
-    pub motions: usize,
+    pub(crate) motions: usize,
 }
 
 /// Holds the newest sweep until its pose arrives, or is known to be lost; likewise its motion, if the one of the sweep
 /// before had arrived.
 #[derive(Debug)]
-pub struct SweepPairing<S> {
+pub(crate) struct SweepPairing<S> {
     timeout: Duration,
     waiting: Option<(u64, S, Instant)>,
     poses: CaptureBuffer<Pose>,
@@ -47,7 +47,7 @@ pub struct SweepPairing<S> {
 impl<S> SweepPairing<S> {
     /// Pairing with at most `timeout` of waiting for the measurements of a sweep.
     #[must_use]
-    pub fn new(timeout: Duration) -> Self {
+    pub(crate) fn new(timeout: Duration) -> Self {
         Self {
             timeout,
             waiting: None,
@@ -60,25 +60,25 @@ impl<S> SweepPairing<S> {
     /// Adds a pose. Returns how many others were dropped: the oldest if there are too many, and those of later sweeps.
     /// Poses arrive in order, so a later one is left over from before the scene restarted.
     #[must_use]
-    pub fn add_pose(&mut self, capture_nanos: u64, pose: Pose) -> usize {
+    pub(crate) fn add_pose(&mut self, capture_nanos: u64, pose: Pose) -> usize {
         self.poses.add(capture_nanos, pose)
     }
 
     /// Adds a motion. Returns as [`Self::add_pose`].
     #[must_use]
-    pub fn add_motion(&mut self, capture_nanos: u64, motion: EgoMotion) -> usize {
+    pub(crate) fn add_motion(&mut self, capture_nanos: u64, motion: EgoMotion) -> usize {
         self.expects_motion = true;
         self.motions.add(capture_nanos, motion)
     }
 
     /// Adds a sweep. Returns the one that it replaces.
     #[must_use]
-    pub fn add_sweep(&mut self, capture_nanos: u64, sweep: S, now: Instant) -> Option<S> {
+    pub(crate) fn add_sweep(&mut self, capture_nanos: u64, sweep: S, now: Instant) -> Option<S> {
         self.waiting.replace((capture_nanos, sweep, now)).map(|(_, superseded, _)| superseded)
     }
 
     /// The sweep, if there is nothing left to wait for.
-    pub fn next(&mut self, now: Instant) -> Option<PairedSweep<S>> {
+    pub(crate) fn next(&mut self, now: Instant) -> Option<PairedSweep<S>> {
         let &(capture_nanos, _, since) = self.waiting.as_ref()?;
         let is_awaited =
             self.poses.is_awaited(capture_nanos) || self.expects_motion && self.motions.is_awaited(capture_nanos);
@@ -94,7 +94,7 @@ impl<S> SweepPairing<S> {
 
     /// Time of the next call of [`Self::next`] if nothing arrives.
     #[must_use]
-    pub fn deadline(&self) -> Option<Instant> {
+    pub(crate) fn deadline(&self) -> Option<Instant> {
         self.waiting.as_ref().map(|(_, _, since)| *since + self.timeout)
     }
 }

@@ -9,13 +9,13 @@ pub(crate) const MAX_EGOS: usize = 64;
 
 /// Paces of the egos, and the interval of the last computed sweep under each.
 #[derive(Debug, Default)]
-pub struct SweepSelection {
+pub(crate) struct SweepSelection {
     paces: BTreeMap<CavId, (Pace, Option<i128>)>,
 }
 
 impl SweepSelection {
     /// Follows the pace of an ego from now on.
-    pub fn follow(&mut self, ego: &CavId, pace: Pace) {
+    pub(crate) fn follow(&mut self, ego: &CavId, pace: Pace) {
         let known = self.paces.get(ego).map(|(known, _)| *known);
         // Egos repeat their pace.
         if known != Some(pace) && (known.is_some() || self.paces.len() < MAX_EGOS) {
@@ -25,7 +25,7 @@ impl SweepSelection {
 
     /// True if a sweep is computed: it is the first of an interval of any ego, or there is no pace. A capture time
     /// before the last one begins anew.
-    pub fn admits(&mut self, capture_nanos: u64) -> bool {
+    pub(crate) fn admits(&mut self, capture_nanos: u64) -> bool {
         let mut is_admitted = self.paces.is_empty();
         for (pace, last) in self.paces.values_mut() {
             let interval = pace.interval_of(capture_nanos);

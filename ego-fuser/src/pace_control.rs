@@ -19,7 +19,7 @@ const PATIENCE: [Duration; 2] = [Duration::from_secs(5), Duration::from_secs(80)
 
 /// Controller of an ego's pace.
 #[derive(Debug)]
-pub struct PaceControl {
+pub(crate) struct PaceControl {
     /// Shortest interval between two sweeps of the own agent so far, nanoseconds.
     period_nanos: Option<u64>,
     /// Sweeps per interval.
@@ -35,7 +35,7 @@ pub struct PaceControl {
 impl PaceControl {
     /// Controller that begins with every sweep.
     #[must_use]
-    pub fn new(now: Instant) -> Self {
+    pub(crate) fn new(now: Instant) -> Self {
         Self {
             period_nanos: None,
             step: 1,
@@ -48,7 +48,7 @@ impl PaceControl {
     }
 
     /// Judges a frame of the own agent; `has_waited`: it waited behind another. Returns the pace if that changes.
-    pub fn judge(&mut self, capture_nanos: u64, has_waited: bool, now: Instant) -> Option<Pace> {
+    pub(crate) fn judge(&mut self, capture_nanos: u64, has_waited: bool, now: Instant) -> Option<Pace> {
         let gap_nanos = self.last_nanos.replace(capture_nanos).and_then(|last| capture_nanos.checked_sub(last));
         // The first frame, or one of a scene that has restarted.
         let gap_nanos = gap_nanos.filter(|gap| *gap > 0)?;

@@ -68,7 +68,7 @@ impl Stream {
     /// Limit of the size of a message of this stream, bytes; `None`: limited by the transport only. For processes that
     /// forward messages without reading them.
     #[must_use]
-    pub fn most_bytes(self) -> Option<usize> {
+    pub(crate) fn most_bytes(self) -> Option<usize> {
         match self {
             Self::Pose | Self::Gnss | Self::Imu | Self::Pace => Some(16 << 10),
             Self::Preview => Some(64 << 10),

@@ -130,7 +130,7 @@ mod tests {
         use crate::{Body, BodyShape, Limits, WireError};
 
         #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-        pub struct Ping {
+        pub(crate) struct Ping {
             pub count: u32,
         }
 

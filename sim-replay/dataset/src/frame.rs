@@ -38,7 +38,7 @@ impl ObjectClass {
 
     /// True for [`Self::VEHICLES`]. An object of unknown type is not a vehicle.
     #[must_use]
-    pub fn is_vehicle(self) -> bool {
+    pub(crate) fn is_vehicle(self) -> bool {
         Self::VEHICLES.contains(&self)
     }
 

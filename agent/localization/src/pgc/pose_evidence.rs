@@ -116,7 +116,7 @@ impl PoseEvidence {
     /// Confidence without calibration: mean confidence of the inliers, from the last stage, times the inlier ratio of
     /// the first one.
     #[must_use]
-    pub fn plain_sigma(&self) -> f64 {
+    pub(crate) fn plain_sigma(&self) -> f64 {
         let inlier_sigma = self.second.map_or(self.inlier_sigma, |second| second.inlier_sigma);
         (inlier_sigma * self.inlier_ratio).clamp(0.0, 1.0)
     }

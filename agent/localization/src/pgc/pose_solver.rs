@@ -52,7 +52,7 @@ pub struct FoundPose {
 }
 
 /// The pose of one sweep, rejected or not, or the reason why there is none.
-pub type Solved = Result<FoundPose, NoRegistration>;
+pub(crate) type Solved = Result<FoundPose, NoRegistration>;
 
 impl PoseSolver {
     /// Solves one sweep.

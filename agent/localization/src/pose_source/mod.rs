@@ -22,9 +22,10 @@ use serde::{Deserialize, Serialize};
 
 pub use error_table::{ErrorTable, ErrorTableError, TableRow};
 pub use localized::{EndToEndPoseConfig, LocalizedPose, PgcConfig};
-pub use noise::{PlanarError, PoseNoise};
+pub use noise::PlanarError;
 pub use noisy::NoisyPose;
-pub use pose_table::{CachedPose, CachedPoseConfig, PoseRow, PoseTable, PoseTableError};
+pub(crate) use pose_table::CachedPose;
+pub use pose_table::{CachedPoseConfig, PoseRow, PoseTable, PoseTableError};
 pub use tracked::{TrackedPose, TrackedPoseConfig};
 
 use crate::pgc::LocalizerError;

@@ -156,7 +156,7 @@ pub struct CachedPoseConfig {
 
 /// Looks up poses that were estimated before.
 #[derive(Debug, Clone)]
-pub struct CachedPose {
+pub(crate) struct CachedPose {
     poses: HashMap<SweepKey, PoseEstimate>,
 }
 
@@ -165,7 +165,7 @@ impl CachedPose {
     ///
     /// # Errors
     /// [`PoseTableError`] names the file and what is wrong with it.
-    pub fn new(config: &CachedPoseConfig) -> Result<Self, PoseTableError> {
+    pub(crate) fn new(config: &CachedPoseConfig) -> Result<Self, PoseTableError> {
         Ok(Self { poses: PoseTable::read(&config.file)?.of_scenario(config.scenario.as_deref())? })
     }
 }

@@ -80,7 +80,7 @@ impl EvaluatedSweep {
 
     /// Error of the pose that is published, if there is one.
     #[must_use]
-    pub fn told_error(&self) -> Option<PoseError> {
+    pub(crate) fn told_error(&self) -> Option<PoseError> {
         self.localization.estimate.world_from_cav().map(|pose| PoseError::between(pose, &self.truth))
     }
 

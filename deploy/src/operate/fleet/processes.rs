@@ -64,7 +64,7 @@ impl Fleet {
     ///
     /// # Errors
     /// [`RunFolderError::Write`] when the run folder cannot be written.
-    pub fn agent_processes(&self, context: &SessionContext<'_>) -> Result<Vec<ProcessSpec>, RunFolderError> {
+    pub(crate) fn agent_processes(&self, context: &SessionContext<'_>) -> Result<Vec<ProcessSpec>, RunFolderError> {
         let mut planner = self.planner(context);
         self.plan_agents(&mut planner)?;
         Ok(planner.specs)

@@ -41,7 +41,7 @@ impl SamplePoses {
 
     /// The same without an added error.
     #[must_use]
-    pub fn without_noise(&self) -> Self {
+    pub(crate) fn without_noise(&self) -> Self {
         Self { noise: None, lost_share: 0.0, ..self.clone() }
     }
 
