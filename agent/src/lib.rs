@@ -14,3 +14,4 @@ pub mod output_filter;
 pub mod rate;
 pub mod sweep_log;
 pub(crate) mod sweep_pairing;
+pub(crate) mod sweep_selection;

@@ -15,7 +15,7 @@ use fusion::Method;
 use link::LinkEmulator;
 use localization::competitors::EndToEndLocalizer;
 use localization::pgc::{Localizer, LocalizerError};
-use localization::pose_source::PoseSourceConfig;
+use localization::pose_source::{PgcConfig, PoseSourceConfig, TrackedPoseConfig};
 use perception::model_config::DetectorConfig;
 use perception::weights::Weights;
 use protocol::{CavId, Principal, Role};
@@ -207,7 +207,10 @@ pub(crate) fn open_options(scene: &SceneConfig) -> OpenOptions {
 /// Loads the networks of a pose source. Every vehicle loads them for itself; errors are better reported once.
 fn load_networks(pose: &PoseSourceConfig) -> Result<(), LocalizerError> {
     match pose {
-        PoseSourceConfig::Pgc(pgc) => Localizer::load(&pgc.encoder, &pgc.head, Device::Cpu).map(drop),
+        PoseSourceConfig::Pgc(PgcConfig { encoder, head, .. })
+        | PoseSourceConfig::Tracked(TrackedPoseConfig { encoder, head, .. }) => {
+            Localizer::load(encoder, head, Device::Cpu).map(drop)
+        }
         PoseSourceConfig::EndToEnd(network) => EndToEndLocalizer::load(&network.weights, Device::Cpu).map(drop),
         PoseSourceConfig::Recorded | PoseSourceConfig::Noisy(_) | PoseSourceConfig::Cached(_) => Ok(()),
     }

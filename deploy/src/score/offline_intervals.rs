@@ -69,11 +69,14 @@ pub(crate) fn concerns(offline: &BTreeSet<String>, account: &Account) -> bool {
     let replay = Role::Replay.to_string();
     let agent = |cav| process_id(Role::Agent, cav).to_string();
     let mut concerned: Vec<String> = match &account.topic {
-        Topic::Stream { stream: Stream::Lidar | Stream::Gnss | Stream::Radar | Stream::Camera(_), .. }
+        Topic::Stream {
+            stream: Stream::Lidar | Stream::Gnss | Stream::Imu | Stream::Radar | Stream::Camera(_),
+            ..
+        }
         | Topic::Truth => {
             vec![replay]
         }
-        Topic::Stream { cav, stream: Stream::Detections | Stream::DetectionsJson } => {
+        Topic::Stream { cav, stream: Stream::Detections | Stream::DetectionsJson | Stream::Pace } => {
             vec![process_id(Role::Ego, cav).to_string()]
         }
         Topic::Stream { cav, .. } => vec![agent(cav)],

@@ -93,7 +93,8 @@ impl Fleet {
     fn agent_config(&self, cav: &CavId, context: &SessionContext<'_>, bus: BusConfig) -> AgentConfig {
         let mut settings = self.scenario.settings_of(cav);
         let scene = self.scenario.scene.scenario.as_deref().unwrap_or_default();
-        settings.pose = settings.pose.for_scenario(scene);
+        let turn = self.agents.iter().position(|agent| agent == cav).and_then(|turn| u32::try_from(turn).ok());
+        settings.pose = settings.pose.for_scenario(scene).with_turn(turn.unwrap_or_default());
         let is_ego = *cav == self.ego;
         if is_ego {
             // It sends to its own ego, not over the link, and the ego needs its complete feature map.
