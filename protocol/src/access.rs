@@ -282,7 +282,11 @@ mod tests {
 
     #[test]
     fn agents_never_subscribe_to_the_truth_or_to_each_other() {
-        assert!(rights("agent-4279", Operation::Subscribe).iter().all(|keys| keys.starts_with("v2v/r1/4279/")));
+        let others: Vec<String> = rights("agent-4279", Operation::Subscribe)
+            .into_iter()
+            .filter(|keys| !keys.starts_with("v2v/r1/4279/"))
+            .collect();
+        assert_eq!(others, ["v2v/r1/*/pace"], "an ego asks every agent for another pace");
         for principal in ["agent-4279", "ego-4279", "link-4279"] {
             assert!(!rights(principal, Operation::Subscribe).contains(&"v2v/r1/truth".to_owned()), "{principal}");
         }

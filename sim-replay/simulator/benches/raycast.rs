@@ -24,7 +24,7 @@ fn sensor_motion(map_model: &MapModel) -> Sweep {
         x.hypot(y)
     };
     let roads = map_model.lanes.lanes.iter().filter(|lane| !lane.in_junction && lane.length_m > 30.0);
-    let lane = roads.min_by(|a, b| center(a).total_cmp(&center(b))).expect("the map_model has a road");
+    let lane = roads.min_by(|a, b| center(a).total_cmp(&center(b))).expect("the map has a road");
     let at = |s_m: f64| {
         let (position, heading) = lane.at(s_m);
         Placement::level(position, heading)

@@ -257,7 +257,7 @@ mod tests {
     #[test]
     fn unusable_maps_are_refused_with_their_path() {
         let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("map_model.xodr");
+        let path = folder.path().join("town.xodr");
         let error = || build(&RoadMapSource::OpenDrive(path.clone()), 0).unwrap_err().to_string();
         assert!(error().starts_with(&path.display().to_string()), "{}", error());
         std::fs::write(&path, "<OpenDRIVE><road id=\"1\" length=\"x\"/></OpenDRIVE>").unwrap();
