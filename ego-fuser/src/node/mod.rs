@@ -181,7 +181,7 @@ impl<'a> Node<'a> {
             frames: VecDeque::new(),
             own_nanos: None,
             ended: BTreeSet::new(),
-            detections: bus.publisher(topic(Stream::Detections), PublisherOptions::DETECTIONS.lossless(RESULTS))?,
+            detections: bus.publisher(topic(Stream::Detections), PublisherOptions::DETECTIONS.waiting(RESULTS))?,
             json: bus.publisher(topic(Stream::DetectionsJson), PublisherOptions::DETECTIONS)?,
             report: NodeReport::default(),
             _own: own,
