@@ -10,6 +10,7 @@ use serde_json::Value;
 use tests::bus::wait_for;
 use tests::faults::{Fault, FaultyFleet, Kind, Results, Target, VEHICLES, write_scenario};
 use tests::fleet::{Up, programs, signal};
+use tests::hosts::{Hosts, router_address};
 use tests::locks::exclusive_lock;
 
 /// Longest gap between two results, milliseconds, at a frame period of 100 ms. The requirement is 300 ms on an idle machine;
@@ -70,10 +71,14 @@ fn fleet(folder: &Path) -> (Up, String) {
     let mut up = Up::start(folder, &scenario);
     let line = up.wait_for_line("run test at ");
     let router = line.split_whitespace().nth(3).expect("an endpoint").trim_end_matches(':').to_owned();
+    wait_until_complete(&mut up);
+    (up, router)
+}
+
+fn wait_until_complete(up: &mut Up) {
     up.wait_for_results("fused results", |results| {
         results.last().is_some_and(|result| tests::fleet::fused(result) == VEHICLES.len() - 1)
     });
-    (up, router)
 }
 
 /// Results published during `period`: their number and the longest gap, milliseconds.
@@ -134,4 +139,34 @@ fn a_vehicle_that_is_cut_off_or_stopped_stops_no_other() {
     });
     assert!(report.findings.longest_gap_ms <= LONGEST_GAP_MS, "{report:?}");
     assert!(report.balances, "{}", report.discrepancies);
+}
+
+#[test]
+#[ignore = "needs network namespaces"]
+fn a_cut_cable_to_a_vehicle_stops_no_other() {
+    let _exclusive = exclusive_lock();
+    let folder = tempfile::tempdir().unwrap();
+    let hosts = Hosts::lay(&["vehicle"]).expect("network namespaces");
+    let far = VEHICLES[3];
+    let network = format!("network: {{listen: 'tcp/0.0.0.0:7447'}}\nremote_agents: ['{far}']");
+    let scenario = write_scenario(folder.path(), &network);
+    let mut up = Up::by(hosts.command("router", &programs().join("v2vloc")), folder.path(), &scenario);
+    up.wait_for_line("run test at ");
+    let mut agent = hosts
+        .command("vehicle", &programs().join("agent"))
+        .args(["run", "--run=test", "--keep-running", "--connect-timeout-s=60"])
+        .arg(format!("--cav={far}"))
+        .arg(format!("--connect=tcp/{}:7447", router_address(0)))
+        .arg(format!("--weights={}", folder.path().join("weights.safetensors").display()))
+        .spawn()
+        .expect("ip runs");
+    wait_until_complete(&mut up);
+    let (number, longest_ms) = results_during(&up, || {
+        hosts.cut(0).unwrap();
+        thread::sleep(Duration::from_secs(16));
+    });
+    let _ = agent.kill();
+    let _ = agent.wait();
+    assert!(longest_ms <= LONGEST_GAP_MS, "{longest_ms} ms between two of {number} results");
+    ends_balanced(up);
 }
