@@ -67,9 +67,9 @@ impl RecordReport {
         let missing = overwritten + undelivered + not_written;
         match failure {
             None if missing == 0 => None,
-            None if *undelivered == missing => {
-                Some(format!("recording with gaps: the recorder was too slow for the router, {missing} messages missing"))
-            }
+            None if *undelivered == missing => Some(format!(
+                "recording with gaps: the recorder was too slow for the router, {missing} messages missing"
+            )),
             None => Some(format!("recording with gaps: the disk is too slow, {missing} messages missing")),
             Some(why) if *messages == 0 => Some(format!("nothing is recorded: {why}, {missing} messages missing")),
             Some(why) => Some(format!(

@@ -59,7 +59,9 @@ pub enum BusError {
         cause: std::io::Error,
     },
     /// The system has too little shared memory.
-    #[error("a pool of {wanted_mib} MiB of shared memory: {free_mib} MiB are free in /dev/shm; every process has a pool of its own")]
+    #[error(
+        "a pool of {wanted_mib} MiB of shared memory: {free_mib} MiB are free in /dev/shm; every process has a pool of its own"
+    )]
     SharedMemory {
         /// Size of the pool, MiB.
         wanted_mib: usize,

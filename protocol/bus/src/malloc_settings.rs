@@ -27,8 +27,10 @@ pub const FEW_PRODUCTS: [Setting; 2] = [("LRU_CACHE_CAPACITY", "16"), ("ONEDNN_P
 /// Threads of a router. zenoh's two threads for incoming messages are not enough: one that closes the connection of a
 /// receiver that took nothing waits up to 10 s in the system (`SO_LINGER` on a socket with unsent data), and with two
 /// such receivers nobody's messages would move.
-pub const ROUTER_THREADS: Setting =
-    ("ZENOH_RUNTIME", "(rx: (worker_threads: 16), tx: (worker_threads: 4), net: (worker_threads: 4), acc: (worker_threads: 4))");
+pub const ROUTER_THREADS: Setting = (
+    "ZENOH_RUNTIME",
+    "(rx: (worker_threads: 16), tx: (worker_threads: 4), net: (worker_threads: 4), acc: (worker_threads: 4))",
+);
 
 /// Executes the process again with these settings, unless they are set already. To be called first of all.
 ///

@@ -375,7 +375,8 @@ mod tests {
         let session = open(&BusOptions::router(Endpoint::loopback(0))).unwrap();
         let (key, stats): (Key, _) = ("v2v/test/7/gnss".parse().unwrap(), MessageStats::new("replay".parse().unwrap()));
         let cav = CavId::new("7").unwrap();
-        let publisher = Publisher::new(&session, (&key, &cav), 1, (&stats, &SharedPool::none()), PublisherOptions::POSE).unwrap();
+        let publisher =
+            Publisher::new(&session, (&key, &cav), 1, (&stats, &SharedPool::none()), PublisherOptions::POSE).unwrap();
         session.close().wait().unwrap();
         let source = GnssSource::Recorded;
         let gnss = Gnss { world_from_lidar: Pose::IDENTITY, position_std_m: 0.0, heading_std_rad: 0.0, source };

@@ -9,9 +9,7 @@ use std::sync::Arc;
 use bytes::Bytes;
 use protocol::wire::Encoded;
 use zenoh::bytes::ZBytes;
-use zenoh::shm::{
-    Defragment, GarbageCollect, PosixShmProviderBackend, ShmProvider, ShmProviderBuilder, ZShmMut,
-};
+use zenoh::shm::{Defragment, GarbageCollect, PosixShmProviderBackend, ShmProvider, ShmProviderBuilder, ZShmMut};
 use zenoh::{Session, Wait};
 
 use super::message_stats::SharedMemoryUse;

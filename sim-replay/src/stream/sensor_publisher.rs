@@ -30,11 +30,9 @@ pub(super) struct SensorPublisher {
 impl SensorPublisher {
     /// Publishers for `agents`. With `is_paced` the sender waits instead of replacing a sweep.
     pub(super) fn open(bus: &Bus, agents: &[CavId], with_radar: bool, is_paced: bool) -> Result<Self, BusError> {
-        let paced =
-            |options: PublisherOptions| if is_paced { options.lossless(LOSSLESS_PLACES) } else { options };
+        let paced = |options: PublisherOptions| if is_paced { options.lossless(LOSSLESS_PLACES) } else { options };
         let sensors = agents.iter().map(|cav| {
-            let publisher =
-                |stream, options| bus.publisher(Topic::Stream { cav: cav.clone(), stream }, paced(options));
+            let publisher = |stream, options| bus.publisher(Topic::Stream { cav: cav.clone(), stream }, paced(options));
             Ok(Sensors {
                 // Small messages have other priorities than sweeps: they do not wait for one on its way to a slow receiver.
                 lidar: publisher(Stream::Lidar, PublisherOptions::SENSOR)?,

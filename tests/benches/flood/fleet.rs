@@ -10,8 +10,8 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result, bail};
 use bus::bounded_queue::Pop;
 use bus::{
-    AccessControl, Bus, BusOptions, Credentials, Endpoint, Event, Identity, InboxLimits, PublisherOptions, SharedMemory,
-    open, unix_nanos,
+    AccessControl, Bus, BusOptions, Credentials, Endpoint, Event, Identity, InboxLimits, PublisherOptions,
+    SharedMemory, open, unix_nanos,
 };
 use protocol::message::Bev;
 use protocol::{

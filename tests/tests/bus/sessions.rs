@@ -414,15 +414,10 @@ fn shared_memory_carries_the_same_messages() {
 /// Sends five sweeps of 960 kB from a process with a pool of `pool_mib`; how they went.
 fn shared_memory_use(router: SharedMemory, pool_mib: usize) -> BTreeMap<SharedMemoryUse, u64> {
     let router = TestRouter::with(|options| BusOptions { shared_memory: router, ..options });
-    let options = BusOptions {
-        shared_memory: SharedMemory::Pool(pool_mib << 20),
-        ..BusOptions::client(router.endpoint.clone())
-    };
-    let identity = bus::Identity {
-        run: "test".parse().unwrap(),
-        process: "replay".parse().unwrap(),
-        cav: cav("replay"),
-    };
+    let options =
+        BusOptions { shared_memory: SharedMemory::Pool(pool_mib << 20), ..BusOptions::client(router.endpoint.clone()) };
+    let identity =
+        bus::Identity { run: "test".parse().unwrap(), process: "replay".parse().unwrap(), cav: cav("replay") };
     let (replay, agent) = (Bus::join(&options, identity).unwrap(), router.join("agent-7", "7"));
     let topic = Topic::Stream { cav: cav("7"), stream: Stream::Lidar };
     let publisher = replay.publisher(topic.clone(), PublisherOptions::SENSOR.lossless(8)).unwrap();

@@ -134,9 +134,10 @@ fn a_vehicle_that_is_cut_off_or_stopped_stops_no_other() {
         lasts: Duration::from_secs(6),
         after: Duration::from_millis(500),
     };
-    let report = FaultyFleet::start(folder.path()).suffer(&[fault(Kind::Silence), fault(Kind::Stop)], |_, fault, ms| {
-        eprintln!("{fault}, as before after {ms} ms")
-    });
+    let report = FaultyFleet::start(folder.path())
+        .suffer(&[fault(Kind::Silence), fault(Kind::Stop)], |_, fault, ms| {
+            eprintln!("{fault}, as before after {ms} ms")
+        });
     assert!(report.findings.longest_gap_ms <= LONGEST_GAP_MS, "{report:?}");
     assert!(report.balances, "{}", report.discrepancies);
 }
