@@ -206,7 +206,8 @@ impl Bus {
     /// # Errors
     /// [`Overdue`] when the session does not close in time; the end of the process closes it.
     pub fn leave(self, limit: Duration) -> Result<(), Overdue> {
-        let Self { session, identity, status, status_thread, .. } = self;
+        let Self { session, identity, status, status_thread, pool, .. } = self;
+        drop(pool);
         status.close();
         shutdown::within(limit, "the zenoh session", move || {
             if status_thread.join().is_err() {
