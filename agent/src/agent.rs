@@ -5,7 +5,8 @@
 use std::time::{Duration, Instant};
 
 use protocol::{
-    BevFeatures, CavId, CodecConfig, Detection, EncodedFeatures, PointCloud, Pose, PoseEstimate, StageTiming, WireError,
+    BevFeatures, CavId, CodecConfig, Detection, EgoMotion, EncodedFeatures, PointCloud, Pose, PoseEstimate,
+    StageTiming, WireError,
 };
 use support::stage_times::StageTimes;
 use tch::Tensor;
@@ -24,6 +25,8 @@ pub struct AgentInput<'a> {
     pub cloud: &'a PointCloud,
     /// `world_from_lidar` as recorded or measured, if there is one.
     pub measured_pose: Option<&'a Pose>,
+    /// Speed and yaw rate of the vehicle, where its sensors measure them.
+    pub motion: EgoMotion,
 }
 
 /// Result of the detector for one sweep.
@@ -95,12 +98,13 @@ impl Agent {
 
     /// First step: the pose, which goes out before anything else is computed.
     pub fn estimate_pose(&mut self, input: &AgentInput<'_>) -> PoseEstimate {
-        self.pose_source.estimate(&PoseInput {
-            cav: &self.cav,
-            capture_nanos: input.capture_nanos,
-            cloud: input.cloud,
-            measured: input.measured_pose,
-        })
+        self.pose_source.estimate(&pose_input(&self.cav, input))
+    }
+
+    /// Last step, after everything of the sweep was published: measures for the poses of later sweeps. True if the
+    /// sweep was measured.
+    pub fn observe(&mut self, input: &AgentInput<'_>) -> bool {
+        self.pose_source.observe(&pose_input(&self.cav, input))
     }
 
     /// Last step if there is no queue: the feature map as `codec` specifies, or smaller if a limit requires it. A live
@@ -120,13 +124,13 @@ impl Agent {
 
     /// Durations of the stages of the last pose, for pose sources that compute.
     #[must_use]
-    pub fn pose_stages(&self) -> &[StageTiming] {
+    pub(crate) fn pose_stages(&self) -> &[StageTiming] {
         self.pose_source.stages()
     }
 
     /// Number of poses so far that the vehicle cannot have reached from the previous ones.
     #[must_use]
-    pub fn pose_jumps(&self) -> u64 {
+    pub(crate) fn pose_jumps(&self) -> u64 {
         self.pose_source.jumps()
     }
 
@@ -159,15 +163,23 @@ impl Agent {
         Ok(Perception { features, confidence: heads.confidence, detections, times: times.into_timings() })
     }
 
-    /// Both steps.
+    /// All steps.
     ///
     /// # Errors
     /// See [`Self::perceive`].
     pub fn process(&mut self, input: &AgentInput<'_>) -> Result<AgentOutput, DetectorError> {
         let began = Instant::now();
         let pose = self.estimate_pose(input);
-        Ok(AgentOutput { pose, pose_time: began.elapsed(), perception: self.perceive(input.cloud)? })
+        let pose_time = began.elapsed();
+        let perception = self.perceive(input.cloud)?;
+        self.observe(input);
+        Ok(AgentOutput { pose, pose_time, perception })
     }
+}
+
+fn pose_input<'a>(cav: &'a CavId, input: &AgentInput<'a>) -> PoseInput<'a> {
+    let AgentInput { capture_nanos, cloud, measured_pose: measured, motion } = *input;
+    PoseInput { cav, capture_nanos, cloud, measured, motion }
 }
 
 #[cfg(test)]
@@ -203,7 +215,8 @@ mod tests {
         let points = (0..3000).map(|k| [(k % 83) as f32 * 0.3 - 12.0, (k % 41) as f32 * 0.3 - 6.0, -1.5, 0.2]);
         let cloud = PointCloud { xyzi: points.collect() };
         let pose = Pose::from_xyz_yaw([5.0, 6.0, 0.0], 0.3);
-        let input = AgentInput { capture_nanos: 0, cloud: &cloud, measured_pose: Some(&pose) };
+        let input =
+            AgentInput { capture_nanos: 0, cloud: &cloud, measured_pose: Some(&pose), motion: EgoMotion::default() };
         let first = agent.process(&input).unwrap();
         assert_eq!(first.pose.world_from_cav(), Some(&pose));
         let Perception { features, confidence, detections, times } = &first.perception;
@@ -236,7 +249,12 @@ mod tests {
     #[test]
     fn an_empty_sweep_without_a_pose_gives_an_output_too() {
         let mut agent = agent();
-        let input = AgentInput { capture_nanos: 0, cloud: &PointCloud::default(), measured_pose: None };
+        let input = AgentInput {
+            capture_nanos: 0,
+            cloud: &PointCloud::default(),
+            measured_pose: None,
+            motion: EgoMotion::default(),
+        };
         let output = agent.process(&input).unwrap();
         assert!(output.pose.world_from_cav().is_none());
         assert!(output.perception.features.values.iter().all(|value| value.is_finite()));

@@ -13,4 +13,5 @@ pub mod node;
 pub mod output_filter;
 pub mod rate;
 pub mod sweep_log;
-pub mod sweep_pairing;
+pub(crate) mod sweep_pairing;
+pub(crate) mod sweep_selection;

@@ -12,14 +12,17 @@ use bus::shutdown::Stop;
 use bus::{Arrival, Bus, BusError, Event, Inbox, MessageStats, Publisher, PublisherOptions, Subscription, unix_nanos};
 use protocol::codec::CodecConfig;
 use protocol::message::{Bev, Boxes, Descriptor, Points};
-use protocol::{DropReason, Dtype, Gnss, Lidar, Limits, PointCloud, PoseEstimate, Role, Stream, Topic, wire};
+use protocol::{
+    DropReason, Dtype, Gnss, KeyExpr, Lidar, Limits, Pace, PointCloud, PoseEstimate, Role, Stream, Topic, wire,
+};
 use support::nanos;
 
 use crate::agent::{Agent, AgentInput, Perception};
 use crate::output_filter::{OutputFilter, Unfiltered};
 use crate::rate::{RateConfig, RateControl, Turn};
 use crate::sweep_log::SweepLog;
-use crate::sweep_pairing::{PairedSweep, SweepPairing};
+use crate::sweep_pairing::{PairedSweep, SweepPairing, Unused};
+use crate::sweep_selection::{MAX_EGOS, SweepSelection};
 
 /// Longest time that a sweep waits for its pose, which was sent before it.
 const POSE_TIMEOUT: Duration = Duration::from_millis(200);
@@ -91,6 +94,11 @@ pub fn run_filtered(
     options: &NodeOptions,
     stop: &Stop,
 ) -> Result<NodeReport, BusError> {
+    let mut agent = agent;
+    // The first sweep does not wait for the tensor library's preparations.
+    if let Err(error) = agent.perceive(&PointCloud::default()) {
+        tracing::warn!("the detector is not warmed up: {error}");
+    }
     let mut node = Node::open(bus, agent, filter, options, stop)?;
     let presence = bus.announce(Role::Agent)?;
     node.listen(stop);
@@ -108,11 +116,13 @@ struct Node<'a> {
     inbox: Arc<Inbox>,
     lidar: Topic,
     gnss: Topic,
+    imu: Topic,
     pairing: SweepPairing<Arrival>,
+    selection: SweepSelection,
     publishers: Publishers,
     report: NodeReport,
     sweep_log: Option<SweepLog>,
-    _subscriptions: [Subscription; 2],
+    _subscriptions: [Subscription; 4],
 }
 
 impl<'a> Node<'a> {
@@ -124,16 +134,20 @@ impl<'a> Node<'a> {
         stop: &Stop,
     ) -> Result<Self, BusError> {
         let topic = |stream| Topic::Stream { cav: agent.cav().clone(), stream };
-        let (lidar, gnss) = (topic(Stream::Lidar), topic(Stream::Gnss));
+        let (lidar, gnss, imu) = (topic(Stream::Lidar), topic(Stream::Gnss), topic(Stream::Imu));
         // One slot: while a sweep is computed only the newest of those that arrive is kept.
-        let inbox = bus.inbox(1, 2);
+        let inbox = bus.inbox(1, 3 + MAX_EGOS);
         stop.on_request({
             let inbox = Arc::clone(&inbox);
             move || inbox.close()
         });
         let publishers = Publishers::open(bus, &agent, options)?;
-        let subscriptions =
-            [bus.subscribe_keeping(gnss.clone(), POSE_SLOTS, &inbox)?, bus.subscribe(lidar.clone(), &inbox)?];
+        let subscriptions = [
+            bus.subscribe_keeping(gnss.clone(), POSE_SLOTS, &inbox)?,
+            bus.subscribe_keeping(imu.clone(), POSE_SLOTS, &inbox)?,
+            bus.subscribe(lidar.clone(), &inbox)?,
+            bus.subscribe_all(&KeyExpr::stream(&bus.identity().run, Stream::Pace), &inbox)?,
+        ];
         let pairing = SweepPairing::new(POSE_TIMEOUT);
         let sweep_log = options.sweep_log.as_deref().map(SweepLog::open).transpose();
         let sweep_log = sweep_log.unwrap_or_else(|error| {
@@ -148,7 +162,9 @@ impl<'a> Node<'a> {
             inbox,
             lidar,
             gnss,
+            imu,
             pairing,
+            selection: SweepSelection::default(),
             publishers,
             report: NodeReport::default(),
             sweep_log,
@@ -177,34 +193,52 @@ impl<'a> Node<'a> {
 
     fn admit(&mut self, arrival: Arrival) {
         let capture_nanos = arrival.header.stamp.capture_nanos;
-        if arrival.topic == self.lidar {
+        if let Topic::Stream { cav, stream: Stream::Pace } = &arrival.topic {
+            if let Some(pace) = self.inbox.decode::<Pace>(&arrival, &self.options.limits) {
+                self.selection.follow(cav, pace);
+                self.bus.stats().received(&arrival.topic);
+            }
+        } else if arrival.topic == self.lidar && !self.selection.admits(capture_nanos) {
+            self.bus.stats().dropped(&self.lidar, DropReason::Paced);
+        } else if arrival.topic == self.lidar {
             let superseded = self.pairing.add_sweep(capture_nanos, arrival, Instant::now());
             if superseded.is_some() {
                 self.bus.stats().dropped(&self.lidar, DropReason::Superseded);
             }
+        } else if arrival.topic == self.imu {
+            if let Some(motion) = self.inbox.decode(&arrival, &self.options.limits) {
+                let motions = self.pairing.add_motion(capture_nanos, motion);
+                self.count_unused(Unused { motions, ..Unused::default() });
+            }
         } else if let Some(Gnss { world_from_lidar, .. }) = self.inbox.decode(&arrival, &self.options.limits) {
-            let displaced = self.pairing.add_pose(capture_nanos, world_from_lidar);
-            self.drop_poses(displaced);
+            let poses = self.pairing.add_pose(capture_nanos, world_from_lidar);
+            self.count_unused(Unused { poses, ..Unused::default() });
         }
     }
 
-    fn drop_poses(&self, count: usize) {
-        // Their sweeps were superseded, and they with them.
-        (0..count).for_each(|_| self.bus.stats().dropped(&self.gnss, DropReason::Superseded));
+    /// Counts measurements whose sweeps were superseded, and they with them.
+    fn count_unused(&self, unused: Unused) {
+        for (topic, count) in [(&self.gnss, unused.poses), (&self.imu, unused.motions)] {
+            (0..count).for_each(|_| self.bus.stats().dropped(topic, DropReason::Superseded));
+        }
     }
 
     fn advance(&mut self, now: Instant) {
-        while let Some((PairedSweep { capture_nanos, sweep, pose }, unused)) = self.pairing.next(now) {
-            self.drop_poses(unused);
-            if pose.is_some() {
-                self.bus.stats().received(&self.gnss);
-            }
+        while let Some(PairedSweep { capture_nanos, sweep, pose, motion, unused }) = self.pairing.next(now) {
+            self.count_unused(unused);
+            let used = [(&self.gnss, pose.is_some()), (&self.imu, motion.is_some())];
+            used.iter().filter(|(_, is_used)| *is_used).for_each(|(topic, _)| self.bus.stats().received(topic));
             let transport = unix_nanos().saturating_sub(sweep.header.stamp.publish_nanos);
             let Some(Lidar { points }) = self.inbox.decode(&sweep, &self.options.limits) else { continue };
             self.bus.stats().timed("lidar transport", Duration::from_nanos(transport));
             self.bus.stats().received(&self.lidar);
             let arrived_nanos = unix_nanos().saturating_sub(nanos::of(sweep.at.elapsed()));
-            self.process(&AgentInput { capture_nanos, cloud: &points, measured_pose: pose.as_ref() });
+            self.process(&AgentInput {
+                capture_nanos,
+                cloud: &points,
+                measured_pose: pose.as_ref(),
+                motion: motion.unwrap_or_default(),
+            });
             // Logged after everything is submitted.
             if let Some(Err(error)) = self.sweep_log.as_mut().map(|log| log.note(capture_nanos, arrived_nanos)) {
                 tracing::warn!("arrivals of sweeps are no longer logged: {error}");
@@ -219,9 +253,7 @@ impl<'a> Node<'a> {
         let pose = self.filter.pose(self.agent.estimate_pose(input));
         stats.timed("pose", began.elapsed());
         self.publishers.pose.submit(input.capture_nanos, pose);
-        for stage in self.agent.pose_stages() {
-            stats.timed(&stage.stage, Duration::from_nanos(stage.nanos));
-        }
+        self.time_pose_stages();
         self.report.no_pose += u64::from(pose.world_from_cav().is_none());
         self.report.pose_jumps = self.agent.pose_jumps();
         match self.agent.perceive(input.cloud) {
@@ -235,11 +267,29 @@ impl<'a> Node<'a> {
                 let shared = self.publishers.points.is_some().then(|| self.agent.share_points(input.cloud));
                 let shared = shared.map(|points| self.filter.points(points));
                 self.publishers.submit(input, pose, perception, shared, stats);
+                self.observe(input);
             }
             Err(error) => {
                 self.report.failed += 1;
                 tracing::error!(capture_nanos = input.capture_nanos, "cannot compute a sweep: {error}");
             }
+        }
+    }
+}
+
+impl Node<'_> {
+    /// Measures for the poses of later sweeps, after everything of this one is submitted.
+    fn observe(&mut self, input: &AgentInput<'_>) {
+        let began = Instant::now();
+        if self.agent.observe(input) {
+            self.time_pose_stages();
+            self.bus.stats().timed("pose measurement", began.elapsed());
+        }
+    }
+
+    fn time_pose_stages(&self) {
+        for stage in self.agent.pose_stages() {
+            self.bus.stats().timed(&stage.stage, Duration::from_nanos(stage.nanos));
         }
     }
 }

@@ -56,7 +56,7 @@ pub struct Turn {
 
 /// Limits the size of each map, given the past ones.
 #[derive(Debug, Clone, PartialEq, Default)]
-pub struct RateControl {
+pub(crate) struct RateControl {
     config: RateConfig,
     /// Capture time of the last map, nanoseconds.
     last_capture_nanos: Option<u64>,
@@ -66,7 +66,7 @@ pub struct RateControl {
 impl RateControl {
     /// State before the first map.
     #[must_use]
-    pub fn new(config: RateConfig) -> Self {
+    pub(crate) fn new(config: RateConfig) -> Self {
         Self { config, ..Self::default() }
     }
 
@@ -75,7 +75,7 @@ impl RateControl {
     ///
     /// # Errors
     /// As [`encode_within`].
-    pub fn encode(
+    pub(crate) fn encode(
         &mut self,
         features: BevFeatures,
         codec: &CodecConfig,

@@ -1,85 +1,145 @@
-//! Sweep pairing: matches each sweep with the measured pose of the same capture time.
+//! Sweep pairing: matches each sweep with the measured pose and motion of the same capture time.
 
 use std::collections::BTreeMap;
 use std::ops::Bound;
 use std::time::{Duration, Instant};
 
-use protocol::Pose;
+use protocol::{EgoMotion, Pose};
 
-/// Poses kept for sweeps that have not arrived: at 10 Hz three seconds.
-const MAX_POSES: usize = 32;
+/// Measurements kept for sweeps that have not arrived: at 10 Hz three seconds.
+const MAX_MEASUREMENTS: usize = 32;
 
-/// A sweep and its pose, if that has arrived.
+/// A sweep with its measurements, if they have arrived.
 #[derive(Debug, PartialEq)]
-pub struct PairedSweep<S> {
+pub(crate) struct PairedSweep<S> {
     /// Capture time, nanoseconds.
-    pub capture_nanos: u64,
+    pub(crate) capture_nanos: u64,
     /// The sweep.
-    pub sweep: S,
+    pub(crate) sweep: S,
     /// The pose measured at the same time.
-    pub pose: Option<Pose>,
+    pub(crate) pose: Option<Pose>,
+    /// The motion measured at the same time.
+    pub(crate) motion: Option<EgoMotion>,
+    /// Poses and motions of earlier sweeps, which were superseded.
+    pub(crate) unused: Unused,
 }
 
-/// Holds the newest sweep until its pose arrives, or is known to be lost.
+/// Numbers of measurements that no sweep used.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub(crate) struct Unused {
+    /// Poses.
+    pub(crate) poses: usize,
+    /// Motions.
+    pub(crate) motions: usize,
+}
+
+/// Holds the newest sweep until its pose arrives, or is known to be lost; likewise its motion, if the one of the sweep
+/// before had arrived.
 #[derive(Debug)]
-pub struct SweepPairing<S> {
+pub(crate) struct SweepPairing<S> {
     timeout: Duration,
     waiting: Option<(u64, S, Instant)>,
-    poses: BTreeMap<u64, Pose>,
+    poses: CaptureBuffer<Pose>,
+    motions: CaptureBuffer<EgoMotion>,
+    expects_motion: bool,
 }
 
 impl<S> SweepPairing<S> {
-    /// Pairing with at most `timeout` of waiting for the pose of a sweep.
+    /// Pairing with at most `timeout` of waiting for the measurements of a sweep.
     #[must_use]
-    pub fn new(timeout: Duration) -> Self {
-        Self { timeout, waiting: None, poses: BTreeMap::new() }
+    pub(crate) fn new(timeout: Duration) -> Self {
+        Self {
+            timeout,
+            waiting: None,
+            poses: CaptureBuffer::default(),
+            motions: CaptureBuffer::default(),
+            expects_motion: false,
+        }
     }
 
     /// Adds a pose. Returns how many others were dropped: the oldest if there are too many, and those of later sweeps.
     /// Poses arrive in order, so a later one is left over from before the scene restarted.
     #[must_use]
-    pub fn add_pose(&mut self, capture_nanos: u64, pose: Pose) -> usize {
-        let left_over = self.take_later(capture_nanos).len();
-        let replaced = usize::from(self.poses.insert(capture_nanos, pose).is_some());
-        let too_many = self.poses.len().saturating_sub(MAX_POSES);
-        for _ in 0..too_many {
-            self.poses.pop_first();
-        }
-        left_over + replaced + too_many
+    pub(crate) fn add_pose(&mut self, capture_nanos: u64, pose: Pose) -> usize {
+        self.poses.add(capture_nanos, pose)
     }
 
-    /// Removes the poses of later sweeps.
-    fn take_later(&mut self, capture_nanos: u64) -> BTreeMap<u64, Pose> {
-        // No capture time is later than the largest one.
-        capture_nanos.checked_add(1).map_or_else(BTreeMap::new, |next| self.poses.split_off(&next))
+    /// Adds a motion. Returns as [`Self::add_pose`].
+    #[must_use]
+    pub(crate) fn add_motion(&mut self, capture_nanos: u64, motion: EgoMotion) -> usize {
+        self.expects_motion = true;
+        self.motions.add(capture_nanos, motion)
     }
 
     /// Adds a sweep. Returns the one that it replaces.
     #[must_use]
-    pub fn add_sweep(&mut self, capture_nanos: u64, sweep: S, now: Instant) -> Option<S> {
+    pub(crate) fn add_sweep(&mut self, capture_nanos: u64, sweep: S, now: Instant) -> Option<S> {
         self.waiting.replace((capture_nanos, sweep, now)).map(|(_, superseded, _)| superseded)
     }
 
-    /// The sweep, if there is nothing left to wait for, and the number of poses without a sweep.
-    pub fn next(&mut self, now: Instant) -> Option<(PairedSweep<S>, usize)> {
+    /// The sweep, if there is nothing left to wait for.
+    pub(crate) fn next(&mut self, now: Instant) -> Option<PairedSweep<S>> {
         let &(capture_nanos, _, since) = self.waiting.as_ref()?;
-        let pose = self.poses.get(&capture_nanos).copied();
-        // Poses arrive in order: a later one shows that this sweep's own is lost.
-        let is_lost = self.poses.range((Bound::Excluded(capture_nanos), Bound::Unbounded)).next().is_some();
-        if pose.is_none() && !is_lost && now < since + self.timeout {
+        let is_awaited =
+            self.poses.is_awaited(capture_nanos) || self.expects_motion && self.motions.is_awaited(capture_nanos);
+        if is_awaited && now < since + self.timeout {
             return None;
         }
-        let later = self.take_later(capture_nanos);
-        let unused = self.poses.len() - usize::from(pose.is_some());
-        self.poses = later;
+        let (pose, poses) = self.poses.take(capture_nanos);
+        let (motion, motions) = self.motions.take(capture_nanos);
+        self.expects_motion = motion.is_some();
         let (_, sweep, _) = self.waiting.take()?;
-        Some((PairedSweep { capture_nanos, sweep, pose }, unused))
+        Some(PairedSweep { capture_nanos, sweep, pose, motion, unused: Unused { poses, motions } })
     }
 
     /// Time of the next call of [`Self::next`] if nothing arrives.
     #[must_use]
-    pub fn deadline(&self) -> Option<Instant> {
+    pub(crate) fn deadline(&self) -> Option<Instant> {
         self.waiting.as_ref().map(|(_, _, since)| *since + self.timeout)
+    }
+}
+
+/// Measurements of one sensor by capture time.
+#[derive(Debug)]
+struct CaptureBuffer<T>(BTreeMap<u64, T>);
+
+impl<T> Default for CaptureBuffer<T> {
+    fn default() -> Self {
+        Self(BTreeMap::new())
+    }
+}
+
+impl<T> CaptureBuffer<T> {
+    /// Adds a measurement; returns how many others were dropped.
+    fn add(&mut self, capture_nanos: u64, measurement: T) -> usize {
+        let left_over = self.take_later(capture_nanos).len();
+        let replaced = usize::from(self.0.insert(capture_nanos, measurement).is_some());
+        let too_many = self.0.len().saturating_sub(MAX_MEASUREMENTS);
+        for _ in 0..too_many {
+            self.0.pop_first();
+        }
+        left_over + replaced + too_many
+    }
+
+    /// True if the measurement may still arrive. They arrive in order: a later one shows that it is lost.
+    fn is_awaited(&self, capture_nanos: u64) -> bool {
+        let later = (Bound::Excluded(capture_nanos), Bound::Unbounded);
+        !self.0.contains_key(&capture_nanos) && self.0.range(later).next().is_none()
+    }
+
+    /// Removes the measurement and all earlier ones, which it counts.
+    fn take(&mut self, capture_nanos: u64) -> (Option<T>, usize) {
+        let later = self.take_later(capture_nanos);
+        let measurement = self.0.remove(&capture_nanos);
+        let unused = self.0.len();
+        self.0 = later;
+        (measurement, unused)
+    }
+
+    /// Removes the measurements of later sweeps.
+    fn take_later(&mut self, capture_nanos: u64) -> BTreeMap<u64, T> {
+        // No capture time is later than the largest one.
+        capture_nanos.checked_add(1).map_or_else(BTreeMap::new, |next| self.0.split_off(&next))
     }
 }
 
@@ -94,8 +154,8 @@ mod tests {
     }
 
     fn paired(pairing: &mut SweepPairing<char>, now: Instant) -> Option<(u64, char, Option<f64>, usize)> {
-        let (PairedSweep { capture_nanos, sweep, pose }, unused) = pairing.next(now)?;
-        Some((capture_nanos, sweep, pose.map(|pose| pose.translation_m[0]), unused))
+        let PairedSweep { capture_nanos, sweep, pose, unused, .. } = pairing.next(now)?;
+        Some((capture_nanos, sweep, pose.map(|pose| pose.translation_m[0]), unused.poses))
     }
 
     #[test]
@@ -151,6 +211,27 @@ mod tests {
         assert_eq!(pairing.add_sweep(10, 'a', now), None);
         assert_eq!(pairing.add_sweep(20, 'b', now), Some('a'));
         let gone: usize = (0..40).map(|k| pairing.add_pose(100 + k, at(0.0))).sum();
-        assert_eq!(gone, 40 - MAX_POSES);
+        assert_eq!(gone, 40 - MAX_MEASUREMENTS);
+    }
+
+    #[test]
+    fn a_vehicle_with_a_motion_sensor_waits_for_it_and_one_without_does_not() {
+        let (mut pairing, now) = (SweepPairing::new(TIMEOUT), Instant::now());
+        let speed = |speed_mps| EgoMotion { speed_mps: Some(speed_mps), yaw_rate_rad_s: None };
+        let sweep = |pairing: &mut SweepPairing<char>, capture_nanos| {
+            assert_eq!(pairing.add_pose(capture_nanos, at(1.0)), 0);
+            assert_eq!(pairing.add_sweep(capture_nanos, 'a', now), None);
+        };
+        sweep(&mut pairing, 10);
+        assert_eq!(pairing.next(now).unwrap().motion, None, "there was never a motion");
+        assert_eq!(pairing.add_motion(15, speed(5.0)) + pairing.add_motion(20, speed(6.0)), 0);
+        sweep(&mut pairing, 20);
+        let paired = pairing.next(now).unwrap();
+        assert_eq!((paired.motion, paired.unused), (Some(speed(6.0)), Unused { poses: 0, motions: 1 }));
+        sweep(&mut pairing, 30);
+        assert_eq!(pairing.next(now), None, "its motion may still arrive");
+        assert_eq!(pairing.next(now + TIMEOUT).unwrap().motion, None);
+        sweep(&mut pairing, 40);
+        assert!(pairing.next(now).is_some(), "the sensor is gone");
     }
 }

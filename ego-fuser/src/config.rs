@@ -71,6 +71,9 @@ pub struct EgoSettings {
     #[arg(long, value_name = "MS")]
     #[schemars(range(max = 600_000))]
     pub max_age_ms: u64,
+    /// Sweeps that the vehicles compute: as many as this ego has time for, or every one.
+    #[arg(long, value_enum)]
+    pub pace: PaceMode,
     /// Leave out neighbours whose messages contradict what the ego perceives itself.
     #[arg(long)]
     pub trust: bool,
@@ -79,9 +82,29 @@ pub struct EgoSettings {
     pub inbox: InboxConfig,
 }
 
+/// Sweeps that the vehicles of a fleet compute.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema, clap::ValueEnum)]
+#[serde(rename_all = "snake_case")]
+#[value(rename_all = "snake_case")]
+pub enum PaceMode {
+    /// As many as the ego has time for, the same in all vehicles: where a machine cannot keep up, answers come less often
+    /// instead of later.
+    #[default]
+    Auto,
+    /// Every sweep that an agent has time for.
+    EverySweep,
+}
+
 impl Default for EgoSettings {
     fn default() -> Self {
-        Self { id: None, deadline_ms: 100, max_age_ms: 150, trust: false, inbox: InboxConfig::default() }
+        Self {
+            id: None,
+            deadline_ms: 100,
+            max_age_ms: 150,
+            pace: PaceMode::Auto,
+            trust: false,
+            inbox: InboxConfig::default(),
+        }
     }
 }
 

@@ -13,9 +13,9 @@ use perception::boxes::decode::Decoded;
 use perception::boxes::postprocess::{AgentBoxes, PostprocessConfig, postprocess};
 use perception::detector::Detector;
 use perception::weights::Weights;
-use protocol::{DecodedFeatures, Detection, DropReason, Pose, StageTiming};
+use protocol::{CavId, DecodedFeatures, Detection, DropReason, PointCloud, Pose, PoseEstimate, StageTiming};
 use support::stage_times::StageTimes;
-use tch::{Kind, TchError, Tensor, no_grad};
+use tch::{Device, Kind, TchError, Tensor, no_grad};
 
 use crate::misbehaviour::{Assessment, MisbehaviourConfig, MisbehaviourDetector};
 use fusion::f64_tensor;
@@ -130,6 +130,30 @@ impl Ego {
     pub fn forget(&mut self) {
         self.history.clear();
         self.trust.iter_mut().for_each(MisbehaviourDetector::clear);
+    }
+
+    /// Detects once without any data, so that the first frame does not wait for the tensor library's preparations.
+    ///
+    /// # Errors
+    /// As [`Self::detect`].
+    pub fn warm_up(&mut self, cav: &CavId) -> Result<(), EgoError> {
+        let content = match self.method.own_content() {
+            Exchange::Boxes => Content::Boxes(Vec::new()),
+            Exchange::Points => Content::Points(PointCloud::default()),
+            Exchange::Features | Exchange::Nothing => {
+                let [channels, height, width] = self.detector.sent_shape();
+                let map = Tensor::f_zeros([1, channels, height, width], (Kind::Float, Device::Cpu))?;
+                Content::Features(DecodedFeatures { features: self.detector.to_message(&map)?, sent: None })
+            }
+        };
+        let pose = PoseEstimate::new(Pose::IDENTITY, 1.0);
+        let view = |capture_nanos| View { cav: cav.clone(), pose, capture_nanos, content: content.clone() };
+        // Twice: methods with a history use the first frame in the second.
+        for capture_nanos in [0, 100_000_000] {
+            self.detect(&view(capture_nanos), &[view(capture_nanos)])?;
+        }
+        self.forget();
+        Ok(())
     }
 
     /// Detects around the ego. Neighbours that cannot be used are left out; with none left the result is ego-only.

@@ -13,6 +13,7 @@ pub mod ego;
 pub mod misbehaviour;
 mod neighbourhood;
 pub mod node;
+pub(crate) mod pace_control;
 pub mod pairing;
 mod peer_models;
 pub mod view;

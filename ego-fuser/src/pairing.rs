@@ -137,7 +137,7 @@ impl<T> Pairing<T> {
 
     /// The clock of the scene was set back to `now_nanos`: removes a CAV's messages of later times, except those up to
     /// `ahead_nanos` early. Returns the number of these that were never used.
-    pub fn turn_back(&mut self, cav: &CavId, now_nanos: u64, ahead_nanos: u64) -> usize {
+    pub(crate) fn turn_back(&mut self, cav: &CavId, now_nanos: u64, ahead_nanos: u64) -> usize {
         let Some(queue) = self.waiting.get_mut(cav) else { return 0 };
         let latest = now_nanos.saturating_add(ahead_nanos);
         let unused = queue.iter().filter(|held| held.capture_nanos > latest && !held.is_used).count();

@@ -87,7 +87,7 @@ impl Principal {
         let (publish, subscribe) = match self.role {
             Role::Agent => {
                 let sensors = SENSORS.into_iter().map(own).chain([keys(&format_args!("{}/camera/*", self.cav))]);
-                (SHARED.map(own).into(), sensors.collect())
+                (SHARED.map(own).into(), sensors.chain([everyones(&Stream::Pace)]).collect())
             }
             Role::Ego => {
                 let shared = SHARED.iter().flat_map(|stream| [everyones(stream), over_link(stream)]);
@@ -144,7 +144,16 @@ impl Principal {
 /// Limits of message sizes, bytes, by key, in any run.
 #[must_use]
 pub fn size_limits() -> Vec<(Vec<KeyExpr>, usize)> {
-    let small = [Stream::Pose, Stream::Gnss, Stream::Preview, Stream::Descriptor, Stream::Boxes, Stream::Detections];
+    let small = [
+        Stream::Pose,
+        Stream::Gnss,
+        Stream::Imu,
+        Stream::Pace,
+        Stream::Preview,
+        Stream::Descriptor,
+        Stream::Boxes,
+        Stream::Detections,
+    ];
     let keys = |stream| [format!("*/{stream}"), format!("rx/*/*/{stream}")];
     let selectors = |topics: Vec<String>| topics.iter().map(|topics| KeyExpr::within(&RunScope::Any, topics)).collect();
     let limit = |stream: Stream| Some((selectors(keys(stream).into()), stream.most_bytes()?));
@@ -154,11 +163,11 @@ pub fn size_limits() -> Vec<(Vec<KeyExpr>, usize)> {
 }
 
 /// Streams that the replay publishes for vehicles, without cameras.
-const SENSORS: [Stream; 3] = [Stream::Lidar, Stream::Gnss, Stream::Radar];
+const SENSORS: [Stream; 4] = [Stream::Lidar, Stream::Gnss, Stream::Imu, Stream::Radar];
 /// Streams of agents.
 const SHARED: [Stream; 5] = [Stream::Pose, Stream::Bev, Stream::Boxes, Stream::Points, Stream::Descriptor];
 /// Streams of an ego for all principals.
-const DETECTIONS: [Stream; 2] = [Stream::Detections, Stream::DetectionsJson];
+const DETECTIONS: [Stream; 3] = [Stream::Detections, Stream::DetectionsJson, Stream::Pace];
 
 impl fmt::Display for Principal {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {

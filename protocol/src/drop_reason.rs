@@ -38,6 +38,8 @@ named! {
         Future = "future",
         /// Sender was excluded by misbehaviour detection.
         Misbehaviour = "misbehaviour",
+        /// Not computed, so that answers come less often instead of later: the ego has no time for this sweep.
+        Paced = "paced",
         /// Exceeds the rate limit of its sender.
         RateLimit = "rate_limit",
         /// Taken by the router and not handed on to this receiver, which took earlier messages too slowly or had lost

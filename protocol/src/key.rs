@@ -30,7 +30,7 @@ use crate::Verb;
 use crate::text::excerpt;
 
 /// First chunk of every key.
-pub const KEY_ROOT: &str = "v2v";
+pub(crate) const KEY_ROOT: &str = "v2v";
 /// Chunk of a key that no process ever declares.
 pub(crate) const UNDECLARED: &str = "undeclared";
 /// Maximum length of a key, bytes; longer texts are rejected.

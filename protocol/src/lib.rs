@@ -119,9 +119,9 @@ pub use key::{Key, KeyError, KeyExpr};
 pub use ledger::{Account, Counts, Ledger};
 pub use limits::Limits;
 pub use message::{
-    AgentTruth, Bev, Boxes, Control, Descriptor, Detections, DetectionsReport, FusedNeighbour, Gnss, GnssSource, Kind,
-    Lidar, Message, ModelHash, NeighbourState, NoPoseReason, Payload, Points, PoseEstimate, Radar, SkippedNeighbour,
-    StageSummary, StageTiming, Stats, TopicCount, TrueObject, Truth,
+    AgentTruth, Bev, Boxes, Control, Descriptor, Detections, DetectionsReport, EgoMotion, FusedNeighbour, Gnss,
+    GnssSource, Kind, Lidar, Message, ModelHash, NeighbourState, NoPoseReason, Pace, Payload, PlanarCovariance, Points,
+    PoseEstimate, Radar, SkippedNeighbour, StageSummary, StageTiming, Stats, TopicCount, TrueObject, Truth,
 };
 pub use misbehaviour_reason::MisbehaviourReason;
 pub use point_cloud::{Handedness, PointCloud};

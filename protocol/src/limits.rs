@@ -26,7 +26,7 @@ pub struct Limits {
 
 impl Limits {
     /// Limit of the metadata decoder itself, independent of the configuration: 1 MiB.
-    pub const HARD_METADATA_BYTES: u32 = 1 << 20;
+    pub(crate) const HARD_METADATA_BYTES: u32 = 1 << 20;
 
     /// Limits of a receiver by default: feature maps of 64 MiB, point clouds of a million points.
     pub const DEFAULT: Self = Self {

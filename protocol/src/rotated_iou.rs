@@ -39,7 +39,7 @@ impl Polygon {
 
     /// Area of overlap of the axis-aligned bounds, square metres: never less than that of the polygons.
     #[must_use]
-    pub fn bounds_overlap(&self, other: &Self) -> f64 {
+    pub(crate) fn bounds_overlap(&self, other: &Self) -> f64 {
         let side = |axis: usize| self.high[axis].min(other.high[axis]) - self.low[axis].max(other.low[axis]);
         side(0).max(0.0) * side(1).max(0.0)
     }

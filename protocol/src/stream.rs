@@ -21,6 +21,8 @@ pub enum Stream {
     Preview,
     /// `gnss`: recorded or GNSS poses.
     Gnss,
+    /// `imu`: speed and yaw rate that the vehicle measures itself.
+    Imu,
     /// `camera/<k>`: images of camera `k`.
     Camera(u8),
     /// `radar`: radar sweeps.
@@ -33,6 +35,8 @@ pub enum Stream {
     Boxes,
     /// `points`: raw points, for the early-fusion baseline only.
     Points,
+    /// `pace`: the sweeps that an ego has time for.
+    Pace,
     /// `descriptor`: model and streams of the vehicle.
     Descriptor,
     /// `detections`: detections of an ego.
@@ -48,11 +52,13 @@ impl Stream {
         Some(match self {
             Self::Lidar | Self::Preview => Kind::Lidar,
             Self::Gnss => Kind::Gnss,
+            Self::Imu => Kind::Imu,
             Self::Radar => Kind::Radar,
             Self::Pose => Kind::Pose,
             Self::Bev => Kind::Bev,
             Self::Boxes => Kind::Boxes,
             Self::Points => Kind::Points,
+            Self::Pace => Kind::Pace,
             Self::Descriptor => Kind::Descriptor,
             Self::Detections => Kind::Detections,
             Self::Camera(_) | Self::DetectionsJson => return None,
@@ -62,9 +68,9 @@ impl Stream {
     /// Limit of the size of a message of this stream, bytes; `None`: limited by the transport only. For processes that
     /// forward messages without reading them.
     #[must_use]
-    pub fn most_bytes(self) -> Option<usize> {
+    pub(crate) fn most_bytes(self) -> Option<usize> {
         match self {
-            Self::Pose | Self::Gnss => Some(16 << 10),
+            Self::Pose | Self::Gnss | Self::Imu | Self::Pace => Some(16 << 10),
             Self::Preview => Some(64 << 10),
             Self::Descriptor | Self::Boxes | Self::Detections => Some(4 << 20),
             Self::Lidar | Self::Camera(_) | Self::Radar | Self::Bev | Self::Points | Self::DetectionsJson => None,
@@ -77,12 +83,14 @@ impl Stream {
             ["lidar"] => Self::Lidar,
             ["@preview"] => Self::Preview,
             ["gnss"] => Self::Gnss,
+            ["imu"] => Self::Imu,
             ["camera", index] => Self::Camera(camera_index(index)?),
             ["radar"] => Self::Radar,
             ["pose"] => Self::Pose,
             ["bev"] => Self::Bev,
             ["boxes"] => Self::Boxes,
             ["points"] => Self::Points,
+            ["pace"] => Self::Pace,
             ["descriptor"] => Self::Descriptor,
             ["detections"] => Self::Detections,
             ["detections", "json"] => Self::DetectionsJson,
@@ -103,12 +111,14 @@ impl fmt::Display for Stream {
             Self::Lidar => f.write_str("lidar"),
             Self::Preview => f.write_str("@preview"),
             Self::Gnss => f.write_str("gnss"),
+            Self::Imu => f.write_str("imu"),
             Self::Camera(index) => write!(f, "camera/{index}"),
             Self::Radar => f.write_str("radar"),
             Self::Pose => f.write_str("pose"),
             Self::Bev => f.write_str("bev"),
             Self::Boxes => f.write_str("boxes"),
             Self::Points => f.write_str("points"),
+            Self::Pace => f.write_str("pace"),
             Self::Descriptor => f.write_str("descriptor"),
             Self::Detections => f.write_str("detections"),
             Self::DetectionsJson => f.write_str("detections/json"),

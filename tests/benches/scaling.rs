@@ -142,6 +142,7 @@ fn recorded_map(model: &str, folder: &Path, dtype: Dtype) -> Result<(PathBuf, En
         capture_nanos: frame.capture_nanos,
         cloud: &frame.points,
         measured_pose: frame.world_from_lidar.as_ref(),
+        motion: frame.motion(),
     };
     let features = agent.process(&input)?.perception.features;
     Ok((file, encode_features(features, &CodecConfig { dtype, ..CodecConfig::default() }, None)?))

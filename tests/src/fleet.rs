@@ -25,7 +25,7 @@ pub const TIMEOUT: Duration = Duration::from_secs(120);
 /// # Panics
 /// When the test has no file.
 #[must_use]
-pub fn programs_dir() -> &'static Path {
+pub(crate) fn programs_dir() -> &'static Path {
     static FOLDER: OnceLock<PathBuf> = OnceLock::new();
     FOLDER.get_or_init(|| {
         // target/<profile>/deps/<this test>

@@ -5,6 +5,7 @@
 //! - [`competitors`]: networks that the paper compares it with.
 //! - [`registration`]: pose from correspondences (Kabsch, RANSAC, SC2-PCR) and ICP.
 //! - [`pose_source`]: origins of a vehicle's pose: recorded, noisy, estimated by one of the above.
+//! - [`tracker`]: the pose from sweep to sweep, with its covariance.
 //! - [`pose_error`], [`statistics`]: measures of their accuracy.
 
 #![warn(clippy::print_stdout, clippy::print_stderr)]
@@ -15,3 +16,4 @@ pub mod pose_error;
 pub mod pose_source;
 pub mod registration;
 pub mod statistics;
+pub mod tracker;

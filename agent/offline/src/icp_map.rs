@@ -117,7 +117,13 @@ mod tests {
         let mut source = IcpMapPose::new(Arc::new(map), config);
         let (cav, cloud) = (CavId::new("7").unwrap(), yard());
         let measured = Pose::from_xyz_yaw([1200.7, -340.9, 20.3], 0.83);
-        let mut input = PoseInput { cav: &cav, capture_nanos: 0, cloud: &cloud, measured: Some(&measured) };
+        let mut input = PoseInput {
+            cav: &cav,
+            capture_nanos: 0,
+            cloud: &cloud,
+            measured: Some(&measured),
+            motion: protocol::EgoMotion::default(),
+        };
         let estimate = source.estimate(&input);
         let off = truth.from_world(estimate.world_from_cav().unwrap()).isometry();
         assert!(off.translation.vector.norm() < 0.01 && off.rotation.angle() < 1e-3, "{off}");

@@ -197,7 +197,7 @@ impl DetectorConfig {
 
     /// Pillars per cell of the transmitted feature map, along one axis.
     #[must_use]
-    pub fn feature_stride(&self) -> i64 {
+    pub(crate) fn feature_stride(&self) -> i64 {
         let shrink = match self.shrink {
             Some(ShrinkConfig::DoubleConv { stride, .. }) => stride,
             Some(ShrinkConfig::Pointwise { .. }) | None => 1,

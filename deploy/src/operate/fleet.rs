@@ -15,7 +15,7 @@ use fusion::Method;
 use link::LinkEmulator;
 use localization::competitors::EndToEndLocalizer;
 use localization::pgc::{Localizer, LocalizerError};
-use localization::pose_source::PoseSourceConfig;
+use localization::pose_source::{PgcConfig, PoseSourceConfig, TrackedPoseConfig};
 use perception::model_config::DetectorConfig;
 use perception::weights::Weights;
 use protocol::{CavId, Principal, Role};
@@ -31,9 +31,9 @@ use crate::scenario::Scenario;
 use crate::scenario::weights_choice::weights_of;
 
 /// Name of the process that plays the scene.
-pub const REPLAY: &str = "replay";
+pub(crate) const REPLAY: &str = "replay";
 /// Name of the process that records all messages.
-pub const RECORDER: &str = "recorder";
+pub(crate) const RECORDER: &str = "recorder";
 
 /// A scenario in which every open setting is filled in.
 #[derive(Debug, Clone)]
@@ -137,13 +137,13 @@ impl Fleet {
 
     /// Rule of the counted objects: those of the protocol inside the area of the model.
     #[must_use]
-    pub fn ground_truth_rule(&self) -> GroundTruthRule {
+    pub(crate) fn ground_truth_rule(&self) -> GroundTruthRule {
         self.protocol.rule_within(self.detector.lidar_range_m)
     }
 
     /// Number of values in one feature map of the model, as transmitted.
     #[must_use]
-    pub fn map_values(&self) -> u64 {
+    pub(crate) fn map_values(&self) -> u64 {
         let grid = self.detector.feature_grid();
         u64::from(grid.width) * u64::from(grid.height) * self.detector.sent_channels() as u64
     }
@@ -158,7 +158,7 @@ impl Fleet {
 
     /// Principal of every process that the run may have, for its keys.
     #[must_use]
-    pub fn parties(&self) -> Vec<Principal> {
+    pub(crate) fn parties(&self) -> Vec<Principal> {
         let agents = self.agents.iter().map(|cav| Principal::new(Role::Agent, cav));
         let egos = [Role::Ego, Role::Link].map(|role| Principal::new(role, &self.ego));
         let others = [Role::Replay, Role::Scorer, Role::Recorder, Role::Viewer].map(Principal::of_role);
@@ -207,7 +207,10 @@ pub(crate) fn open_options(scene: &SceneConfig) -> OpenOptions {
 /// Loads the networks of a pose source. Every vehicle loads them for itself; errors are better reported once.
 fn load_networks(pose: &PoseSourceConfig) -> Result<(), LocalizerError> {
     match pose {
-        PoseSourceConfig::Pgc(pgc) => Localizer::load(&pgc.encoder, &pgc.head, Device::Cpu).map(drop),
+        PoseSourceConfig::Pgc(PgcConfig { encoder, head, .. })
+        | PoseSourceConfig::Tracked(TrackedPoseConfig { encoder, head, .. }) => {
+            Localizer::load(encoder, head, Device::Cpu).map(drop)
+        }
         PoseSourceConfig::EndToEnd(network) => EndToEndLocalizer::load(&network.weights, Device::Cpu).map(drop),
         PoseSourceConfig::Recorded | PoseSourceConfig::Noisy(_) | PoseSourceConfig::Cached(_) => Ok(()),
     }

@@ -80,7 +80,7 @@ struct Noted {
 
 /// Monitors the processes of a run.
 #[derive(Debug)]
-pub struct Health {
+pub(crate) struct Health {
     processes: BTreeMap<String, Noted>,
     /// Longest silence of a ready process.
     hang: Duration,
@@ -92,12 +92,12 @@ pub struct Health {
 impl Health {
     /// No process yet. One that is silent for `hang`, or for `start` after it was started, is to be replaced.
     #[must_use]
-    pub fn new(hang: Duration, start: Duration) -> Self {
+    pub(crate) fn new(hang: Duration, start: Duration) -> Self {
         Self { processes: BTreeMap::new(), hang, start, looked: Instant::now() }
     }
 
     /// Records an event of a process.
-    pub fn note(&mut self, event: &ProcessEvent, now: Instant) {
+    pub(crate) fn note(&mut self, event: &ProcessEvent, now: Instant) {
         let noted = self.processes.entry(event.name.clone()).or_insert_with(|| Noted {
             state: State::Starting,
             pid: None,
@@ -133,14 +133,14 @@ impl Health {
     }
 
     /// Records the failure of a process.
-    pub fn fails(&mut self, name: &str, text: &str) {
+    pub(crate) fn fails(&mut self, name: &str, text: &str) {
         if let Some(noted) = self.processes.get_mut(name) {
             noted.failure = Some(text.to_owned());
         }
     }
 
     /// Updates the states from the times of the last reports; returns the hung processes, each with a description.
-    pub fn look(&mut self, last_reports: &BTreeMap<String, Instant>, now: Instant) -> Vec<(String, String)> {
+    pub(crate) fn look(&mut self, last_reports: &BTreeMap<String, Instant>, now: Instant) -> Vec<(String, String)> {
         let was_stopped = now.saturating_duration_since(self.looked) > OWN_PAUSE;
         self.looked = now;
         // The reports of this program come over the same bus. Without any report at all, the network is down, and no
@@ -179,7 +179,7 @@ impl Health {
 
     /// Status of every process.
     #[must_use]
-    pub fn statuses(&self, now: Instant) -> Vec<ProcessStatus> {
+    pub(crate) fn statuses(&self, now: Instant) -> Vec<ProcessStatus> {
         let seconds = |at: Instant| now.saturating_duration_since(at).as_secs_f64();
         let status = |(name, noted): (&String, &Noted)| {
             let usage = noted.pid.and_then(Usage::of).unwrap_or_default();

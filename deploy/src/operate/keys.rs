@@ -25,7 +25,7 @@ use rcgen::{
 };
 
 /// File name of the authority's key.
-pub const AUTHORITY_KEY: &str = "authority.key";
+pub(crate) const AUTHORITY_KEY: &str = "authority.key";
 const AUTHORITY_NAME: &str = "v2vloc test authority";
 const DAY: Duration = Duration::from_secs(24 * 3600);
 /// Certificates hold from a little before they are made: clocks differ.

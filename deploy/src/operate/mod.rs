@@ -13,4 +13,4 @@ pub mod run_folder;
 pub mod security;
 pub mod status;
 pub(crate) mod status_reporter;
-pub mod supervise;
+pub(crate) mod supervise;

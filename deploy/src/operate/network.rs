@@ -19,7 +19,7 @@ use crate::score::scorer_cav;
 const CLOSE_LIMIT: Duration = Duration::from_millis(500);
 
 /// An open session, and the endpoint that the other processes connect to.
-pub struct RouterEndpoint {
+pub(crate) struct RouterEndpoint {
     /// The session of this process.
     pub session: Session,
     /// Endpoint that the other processes are given.
@@ -33,7 +33,7 @@ impl RouterEndpoint {
     ///
     /// # Errors
     /// [`BusError`] when the port is in use, no router answers, the endpoint is invalid or the keys do not fit.
-    pub fn open(network: &Network, run: &RunId, keys: Option<&RunKeys>) -> Result<Self, BusError> {
+    pub(crate) fn open(network: &Network, run: &RunId, keys: Option<&RunKeys>) -> Result<Self, BusError> {
         let options = match &network.connect {
             Some(router) => {
                 let options = BusOptions::client(Endpoint::new(router)?);
@@ -58,7 +58,7 @@ impl RouterEndpoint {
     ///
     /// # Errors
     /// [`RunError::Live`] names those present; [`RunError::Network`] when the router does not answer.
-    pub fn check_free(&self, network: &Network, run: &RunId, specs: &[ProcessSpec]) -> Result<(), RunError> {
+    pub(crate) fn check_free(&self, network: &Network, run: &RunId, specs: &[ProcessSpec]) -> Result<(), RunError> {
         if network.connect.is_none() {
             return Ok(());
         }
@@ -76,7 +76,7 @@ impl RouterEndpoint {
     ///
     /// # Errors
     /// [`Overdue`] when the session does not close in time.
-    pub fn close(self) -> Result<(), Overdue> {
+    pub(crate) fn close(self) -> Result<(), Overdue> {
         shutdown::within(CLOSE_LIMIT, "the router", move || {
             if let Err(cause) = self.session.close().wait() {
                 tracing::debug!("closing the router: {cause}");

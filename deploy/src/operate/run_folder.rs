@@ -28,11 +28,11 @@ pub enum RunFolderError {
 }
 
 /// The recording of a run.
-pub const RECORDING: &str = "recording.mcap";
+pub(crate) const RECORDING: &str = "recording.mcap";
 /// Arrival times of the sweeps at the ego's agent.
-pub const SWEEP_LOG: &str = "sweeps.csv";
+pub(crate) const SWEEP_LOG: &str = "sweeps.csv";
 /// Checkpoint of the replay, from which a restarted one resumes.
-pub const CHECKPOINT: &str = "replay.json";
+pub(crate) const CHECKPOINT: &str = "replay.json";
 
 /// The folder of one run.
 #[derive(Debug, Clone)]
@@ -101,7 +101,7 @@ impl RunFolder {
     ///
     /// # Errors
     /// [`RunFolderError::Write`].
-    pub fn write_config(&self, process: &str, config: &impl Serialize) -> Result<PathBuf, RunFolderError> {
+    pub(crate) fn write_config(&self, process: &str, config: &impl Serialize) -> Result<PathBuf, RunFolderError> {
         let name = format!("config/{process}.yaml");
         let path = self.file(&name);
         let unwritable = |source| RunFolderError::Write { path: path.clone(), source };

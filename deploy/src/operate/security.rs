@@ -41,7 +41,7 @@ impl RunKeys {
 
     /// The folder of one process.
     #[must_use]
-    pub fn of_process(&self, name: &str) -> PathBuf {
+    pub(crate) fn of_process(&self, name: &str) -> PathBuf {
         self.folder.join(name)
     }
 
@@ -49,7 +49,7 @@ impl RunKeys {
     ///
     /// # Errors
     /// [`BusError::Keys`] names the problem.
-    pub fn for_router(&self, options: BusOptions, run: &RunId) -> Result<BusOptions, BusError> {
+    pub(crate) fn for_router(&self, options: BusOptions, run: &RunId) -> Result<BusOptions, BusError> {
         let credentials = self.read(ROUTER)?;
         let guard = AccessControl { members: credentials.members()?, runs: RunScope::One(run.clone()) };
         Ok(options.with_credentials(credentials).with_access_control(guard))
@@ -59,7 +59,7 @@ impl RunKeys {
     ///
     /// # Errors
     /// [`BusError::Keys`] names the problem.
-    pub fn for_client(&self, options: BusOptions, name: &str) -> Result<BusOptions, BusError> {
+    pub(crate) fn for_client(&self, options: BusOptions, name: &str) -> Result<BusOptions, BusError> {
         Ok(options.with_credentials(self.read(name)?))
     }
 

@@ -133,8 +133,8 @@ impl RunStatus {
     }
 
     /// True if there is no problem.
-    #[must_use]
-    pub fn is_well(&self) -> bool {
+    #[cfg(test)]
+    fn is_well(&self) -> bool {
         self.troubles().is_empty()
     }
 
@@ -212,7 +212,7 @@ fn name_of(value: &impl Serialize) -> String {
 
 /// Writes the status of a run periodically.
 #[derive(Debug)]
-pub struct StatusWriter {
+pub(crate) struct StatusWriter {
     path: PathBuf,
     run: String,
     endpoint: String,
@@ -225,7 +225,7 @@ pub struct StatusWriter {
 impl StatusWriter {
     /// For the run in `folder`, with its router at `endpoint`.
     #[must_use]
-    pub fn new(folder: &Path, run: &str, endpoint: &str) -> Self {
+    pub(crate) fn new(folder: &Path, run: &str, endpoint: &str) -> Self {
         Self {
             path: folder.join(FILE),
             run: run.to_owned(),
@@ -237,7 +237,12 @@ impl StatusWriter {
     }
 
     /// Writes the status if it is due, or if `phase` has changed.
-    pub fn write(&mut self, phase: Phase, progress: &Progress, processes: impl FnOnce(Instant) -> Vec<ProcessStatus>) {
+    pub(crate) fn write(
+        &mut self,
+        phase: Phase,
+        progress: &Progress,
+        processes: impl FnOnce(Instant) -> Vec<ProcessStatus>,
+    ) {
         let now = Instant::now();
         if phase == Phase::Running && self.written.is_some_and(|written| now.duration_since(written) < PERIOD) {
             return;

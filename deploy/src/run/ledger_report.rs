@@ -10,7 +10,7 @@ use crate::score::ProcessStats;
 
 /// Message accounting of a run.
 #[derive(Debug, Clone, Serialize)]
-pub struct LedgerReport {
+pub(crate) struct LedgerReport {
     /// True if every message that was sent is received, dropped for a reason, or in flight.
     pub balances: bool,
     /// Discrepancies, and topics without subscribers.
@@ -32,7 +32,7 @@ pub struct LedgerReport {
 
 /// Requests of one peer that the router refused.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
-pub struct RefusedReport {
+pub(crate) struct RefusedReport {
     /// Common name of its certificate.
     pub peer: String,
     /// `put`, `declare`, `query`.
@@ -45,7 +45,7 @@ pub struct RefusedReport {
 
 /// Ledger of one process instance.
 #[derive(Debug, Clone, Serialize)]
-pub struct ProcessReport {
+pub(crate) struct ProcessReport {
     /// Name of the process.
     pub process: String,
     /// Its message counters.
@@ -58,7 +58,7 @@ impl LedgerReport {
     /// Report on `ledgers`, whose sum is `sum`; processes that were offline, and the number of messages exempt for
     /// that.
     #[must_use]
-    pub fn new(
+    pub(crate) fn new(
         ledgers: &[ProcessStats],
         sum: &Ledger,
         balance: &Reconciliation,
@@ -83,7 +83,7 @@ impl LedgerReport {
 
     /// Adds the requests that the router of the run refused.
     #[must_use]
-    pub fn with_refused(self, refused: &BTreeMap<Rejection, u64>) -> Self {
+    pub(crate) fn with_refused(self, refused: &BTreeMap<Rejection, u64>) -> Self {
         let refused = refused.iter().map(|(Rejection { peer, message, reason }, count)| RefusedReport {
             peer: peer.clone(),
             message: message.clone(),

@@ -1,6 +1,6 @@
 //! One run of a fleet, live or in simulation time: from a scenario to the metrics in its run folder.
 
 pub mod demo;
-pub mod ledger_report;
+pub(crate) mod ledger_report;
 pub mod run_fleet;
 pub mod stepped;

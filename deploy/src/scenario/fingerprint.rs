@@ -4,7 +4,7 @@ use std::fs::File;
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 
-use localization::pose_source::PoseSourceConfig;
+use localization::pose_source::{PgcConfig, PoseSourceConfig, TrackedPoseConfig};
 use protocol::text::hex;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -42,8 +42,9 @@ impl Provenance {
         let (mut localizer_sha256, mut end_to_end_sha256) = (None, None);
         for pose in poses {
             match pose {
-                PoseSourceConfig::Pgc(pgc) => {
-                    localizer_sha256 = Some([hash_file(&pgc.encoder)?.1, hash_file(&pgc.head)?.1]);
+                PoseSourceConfig::Pgc(PgcConfig { encoder, head, .. })
+                | PoseSourceConfig::Tracked(TrackedPoseConfig { encoder, head, .. }) => {
+                    localizer_sha256 = Some([hash_file(encoder)?.1, hash_file(head)?.1]);
                 }
                 PoseSourceConfig::EndToEnd(network) => end_to_end_sha256 = Some(hash_file(&network.weights)?.1),
                 PoseSourceConfig::Recorded | PoseSourceConfig::Noisy(_) | PoseSourceConfig::Cached(_) => {}

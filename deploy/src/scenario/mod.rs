@@ -9,7 +9,7 @@ mod error;
 pub mod fingerprint;
 mod load;
 mod overrides;
-pub mod weights_choice;
+pub(crate) mod weights_choice;
 
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
@@ -140,7 +140,7 @@ impl Scenario {
 
     /// Settings of vehicle `cav`: `agents`, with its own entry of `vehicles` on top.
     #[must_use]
-    pub fn settings_of(&self, cav: &CavId) -> AgentSettings {
+    pub(crate) fn settings_of(&self, cav: &CavId) -> AgentSettings {
         self.vehicles.get(cav).map_or_else(|| self.agents.clone(), |own| own.over(&self.agents))
     }
 }

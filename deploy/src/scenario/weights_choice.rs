@@ -60,7 +60,7 @@ pub enum WeightsChoiceError {
 ///
 /// # Errors
 /// [`WeightsChoiceError`] when the folder does not hold exactly one.
-pub fn weights_of(path: &Path, method: Method) -> Result<PathBuf, WeightsChoiceError> {
+pub(crate) fn weights_of(path: &Path, method: Method) -> Result<PathBuf, WeightsChoiceError> {
     if !path.is_dir() {
         return Ok(path.to_path_buf());
     }

@@ -45,7 +45,7 @@ pub struct FrameRecord {
 
 /// A result and its ground truth, for pictures.
 #[derive(Debug, Clone)]
-pub struct JudgedFrame {
+pub(crate) struct JudgedFrame {
     /// Tick of the scene, counted from 0.
     pub tick: u64,
     /// Result of the ego.

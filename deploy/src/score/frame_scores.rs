@@ -62,7 +62,7 @@ impl FrameScores {
     }
 
     /// Continues with the results of another vehicle: in another scenario.
-    pub fn change_ego(&mut self, ego: &CavId) {
+    pub(crate) fn change_ego(&mut self, ego: &CavId) {
         self.ego.clone_from(ego);
         self.live.forget();
     }
@@ -103,7 +103,7 @@ impl FrameScores {
 
     /// Frame for the picture so far: the one with the most neighbours, then true boxes.
     #[must_use]
-    pub fn showpiece(&self) -> Option<&JudgedFrame> {
+    pub(crate) fn showpiece(&self) -> Option<&JudgedFrame> {
         self.best.as_ref()
     }
 
@@ -127,7 +127,7 @@ impl FrameScores {
 
     /// Errors of all vehicles' poses.
     #[must_use]
-    pub fn pose_errors(&self) -> PoseErrors {
+    pub(crate) fn pose_errors(&self) -> PoseErrors {
         PoseErrors::of(&self.pose_errors, self.no_pose)
     }
 
@@ -195,7 +195,7 @@ impl FrameScores {
 
     /// Scores a frame whose truth is known already, at once; `poses` are the estimates of all vehicles. The same frame
     /// must not be given to [`Self::truth`], [`Self::result`] and [`Self::pose`].
-    pub fn judge_whole(
+    pub(crate) fn judge_whole(
         &mut self,
         (tick, capture_nanos): (u64, u64),
         latency_ms: Option<f64>,

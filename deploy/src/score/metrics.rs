@@ -200,7 +200,7 @@ impl Messages {
     /// True if most of the messages that were sent neither arrived nor were lost: then the link carries next to
     /// nothing.
     #[must_use]
-    pub fn are_stuck(&self) -> bool {
+    pub(crate) fn are_stuck(&self) -> bool {
         self.in_flight >= FEW && self.in_flight > self.sent / 2
     }
 }

@@ -1,6 +1,6 @@
 //! Score of a run: detections against the truth, poses, latencies, bytes, and message accounting.
 
-pub mod evaluated_frame;
+pub(crate) mod evaluated_frame;
 mod frame_record;
 mod frame_scores;
 mod live_precision;
@@ -8,15 +8,17 @@ pub mod metrics;
 mod neighbours;
 mod node;
 mod numbered_results;
-pub mod offline_intervals;
+pub(crate) mod offline_intervals;
 mod open_ticks;
 mod result_lines;
 mod stage_stamps;
 mod true_boxes;
 
-pub use frame_record::{FrameRecord, JudgedFrame};
+pub use frame_record::FrameRecord;
+
+pub(crate) use frame_record::JudgedFrame;
 pub use frame_scores::FrameScores;
 pub use neighbours::NeighbourRecord;
-pub use node::{ProcessStats, Progress, Scored, ScorerError, ScorerNode, scorer_cav};
-pub use stage_stamps::StageStamps;
-pub use true_boxes::true_boxes;
+pub use node::{ProcessStats, Progress, Scored, ScorerError};
+pub(crate) use node::{ScorerNode, scorer_cav};
+pub(crate) use stage_stamps::StageStamps;

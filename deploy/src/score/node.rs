@@ -107,7 +107,7 @@ pub enum ScorerError {
 }
 
 /// A running scorer.
-pub struct ScorerNode {
+pub(crate) struct ScorerNode {
     bus: Bus,
     inbox: Arc<Inbox>,
     progress: Arc<Mutex<Progress>>,
@@ -123,7 +123,7 @@ impl ScorerNode {
     ///
     /// # Errors
     /// [`ScorerError`] when the bus, the file or the system refuses.
-    pub fn start(
+    pub(crate) fn start(
         session: Session,
         run: &RunId,
         agents: &[CavId],
@@ -168,20 +168,20 @@ impl ScorerNode {
     ///
     /// # Errors
     /// [`ScorerError::Bus`] when the address cannot be listened at.
-    pub fn serve_metrics(&mut self, address: std::net::SocketAddr) -> Result<(), ScorerError> {
+    pub(crate) fn serve_metrics(&mut self, address: std::net::SocketAddr) -> Result<(), ScorerError> {
         self.bus.serve_metrics(address)?;
         Ok(())
     }
 
     /// Progress so far.
     #[must_use]
-    pub fn progress(&self) -> Progress {
+    pub(crate) fn progress(&self) -> Progress {
         self.progress.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
     /// Processes that were offline so far.
     #[must_use]
-    pub fn absent(&self) -> BTreeSet<String> {
+    pub(crate) fn absent(&self) -> BTreeSet<String> {
         self.offline.so_far()
     }
 
@@ -190,7 +190,7 @@ impl ScorerNode {
     /// # Panics
     /// When the scorer's own thread has panicked.
     #[must_use]
-    pub fn finish(self) -> Scored {
+    pub(crate) fn finish(self) -> Scored {
         self.inbox.close();
         let (board, stats, unwritten) = self.thread.join().expect("the scorer's thread has no reason to panic");
         let own = ProcessStats {
@@ -214,7 +214,7 @@ impl ScorerNode {
 /// # Panics
 /// Never: the name is an identifier.
 #[must_use]
-pub fn scorer_cav() -> CavId {
+pub(crate) fn scorer_cav() -> CavId {
     CavId::new(SCORER).expect("six lower-case letters")
 }
 

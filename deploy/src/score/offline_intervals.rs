@@ -13,7 +13,7 @@ use protocol::{Account, Role, Stream, Topic};
 const ROLES: [Role; 4] = [Role::Agent, Role::Ego, Role::Link, Role::Replay];
 
 /// Records the processes that leave and rejoin.
-pub struct OfflineIntervals {
+pub(crate) struct OfflineIntervals {
     state: Arc<Mutex<State>>,
     _watches: Vec<LivelinessSubscription>,
 }
@@ -31,7 +31,7 @@ impl OfflineIntervals {
     ///
     /// # Errors
     /// [`BusError::Zenoh`] when the session is closed.
-    pub fn watch(bus: &Bus) -> Result<Self, BusError> {
+    pub(crate) fn watch(bus: &Bus) -> Result<Self, BusError> {
         let state = Arc::<Mutex<State>>::default();
         let watch = |role| {
             let state = Arc::clone(&state);
@@ -56,7 +56,7 @@ impl OfflineIntervals {
     /// Processes that were offline so far. One that does not return counts too, except the replay, which leaves when
     /// the scene is over.
     #[must_use]
-    pub fn so_far(&self) -> BTreeSet<String> {
+    pub(crate) fn so_far(&self) -> BTreeSet<String> {
         let state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
         let replay = Role::Replay.to_string();
         state.returned.iter().chain(state.gone.iter().filter(|name| **name != replay)).cloned().collect()
@@ -65,15 +65,18 @@ impl OfflineIntervals {
 
 /// True if a process that the account concerns was offline: sender, receiver or the link between them.
 #[must_use]
-pub fn concerns(offline: &BTreeSet<String>, account: &Account) -> bool {
+pub(crate) fn concerns(offline: &BTreeSet<String>, account: &Account) -> bool {
     let replay = Role::Replay.to_string();
     let agent = |cav| process_id(Role::Agent, cav).to_string();
     let mut concerned: Vec<String> = match &account.topic {
-        Topic::Stream { stream: Stream::Lidar | Stream::Gnss | Stream::Radar | Stream::Camera(_), .. }
+        Topic::Stream {
+            stream: Stream::Lidar | Stream::Gnss | Stream::Imu | Stream::Radar | Stream::Camera(_),
+            ..
+        }
         | Topic::Truth => {
             vec![replay]
         }
-        Topic::Stream { cav, stream: Stream::Detections | Stream::DetectionsJson } => {
+        Topic::Stream { cav, stream: Stream::Detections | Stream::DetectionsJson | Stream::Pace } => {
             vec![process_id(Role::Ego, cav).to_string()]
         }
         Topic::Stream { cav, .. } => vec![agent(cav)],

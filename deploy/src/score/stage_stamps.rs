@@ -26,7 +26,7 @@ impl StageStamps {
     /// Stamps of a tick with publication times, Unix nanoseconds: of the tick `began_nanos`, of the ego's pose
     /// `posed_nanos`, of its detections `detected_nanos`. `stages` are the durations of the ego's stages.
     #[must_use]
-    pub fn of(began_nanos: u64, posed_nanos: Option<u64>, detected_nanos: u64, stages: &[StageTiming]) -> Self {
+    pub(crate) fn of(began_nanos: u64, posed_nanos: Option<u64>, detected_nanos: u64, stages: &[StageTiming]) -> Self {
         let since = |nanos: u64| ms_between(began_nanos, nanos);
         let took =
             |name: &str| stages.iter().find(|timing| timing.stage == name).map(|timing| timing.nanos as f64 / 1e6);
@@ -54,7 +54,7 @@ impl StageStamps {
 
     /// Milliseconds from the publication of the tick to `nanos`.
     #[must_use]
-    pub fn since_began_ms(&self, nanos: u64) -> Option<f64> {
+    pub(crate) fn since_began_ms(&self, nanos: u64) -> Option<f64> {
         self.began_nanos.map(|began| ms_between(began, nanos))
     }
 }

@@ -6,7 +6,7 @@ use protocol::{AgentTruth, Box3d, CavId, Handedness, Truth};
 
 /// Ground-truth boxes of the ego, in its LiDAR frame.
 #[must_use]
-pub fn true_boxes(truth: &Truth, ego: &CavId, rule: &GroundTruthRule) -> Vec<Box3d> {
+pub(crate) fn true_boxes(truth: &Truth, ego: &CavId, rule: &GroundTruthRule) -> Vec<Box3d> {
     let frames: Vec<Frame> = truth.agents.iter().map(as_frame).collect();
     let Some(ego_index) = frames.iter().position(|frame| frame.cav == *ego) else { return Vec::new() };
     let merged = ground_truth::merge(&frames.iter().collect::<Vec<_>>(), ego_index, rule);

@@ -18,7 +18,7 @@ const MOST_VEHICLES: usize = 128;
 
 /// A captured message.
 #[derive(Debug, Clone, Copy)]
-pub struct ReceivedMessage<'a> {
+pub(crate) struct ReceivedMessage<'a> {
     /// Topic of its publication.
     pub topic: &'a Topic,
     /// Header of the message.
@@ -31,7 +31,7 @@ pub struct ReceivedMessage<'a> {
 
 /// Messages so far, by capture time.
 #[derive(Default)]
-pub struct FrameAssembler {
+pub(crate) struct FrameAssembler {
     open: BTreeMap<u64, OpenFrame>,
     shown_until: Option<u64>,
     /// Epoch of the replay that publishes the truth.
@@ -66,7 +66,7 @@ struct Arrival {
 impl FrameAssembler {
     /// Adds a message. A result completes its scene frame, which is returned; so is a scene frame without a result when
     /// too many wait. Invalid messages are ignored here and counted by their receivers.
-    pub fn add(&mut self, seen: &ReceivedMessage<'_>) -> Option<SceneFrame> {
+    pub(crate) fn add(&mut self, seen: &ReceivedMessage<'_>) -> Option<SceneFrame> {
         if let Topic::Stats(_) = seen.topic {
             self.keep_ledger(seen);
             return None;
@@ -99,7 +99,7 @@ impl FrameAssembler {
     }
 
     /// The scene frame at `capture_nanos` with the messages so far; older ones are dropped.
-    pub fn show(&mut self, capture_nanos: u64) -> Option<SceneFrame> {
+    pub(crate) fn show(&mut self, capture_nanos: u64) -> Option<SceneFrame> {
         let frame = self.open.remove(&capture_nanos)?;
         self.open.retain(|at, _| *at > capture_nanos);
         self.shown_until = Some(capture_nanos);
@@ -107,7 +107,7 @@ impl FrameAssembler {
     }
 
     /// Forgets which scene frames were shown: a recording is shown in any order.
-    pub fn rewind(&mut self) {
+    pub(crate) fn rewind(&mut self) {
         *self = Self::default();
     }
 

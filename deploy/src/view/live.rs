@@ -68,8 +68,8 @@ impl LiveRun {
     }
 
     /// Number of open pages.
-    #[must_use]
-    pub fn watchers(&self) -> usize {
+    #[cfg(test)]
+    pub(crate) fn watchers(&self) -> usize {
         self.newest.receiver_count()
     }
 

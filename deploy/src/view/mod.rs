@@ -13,7 +13,6 @@ mod server;
 #[cfg(test)]
 mod tests;
 
-pub use frame_assembler::{FrameAssembler, ReceivedMessage};
 pub use live::LiveRun;
 pub use recorded::{RecordedRun, ViewError};
 pub use scene_frame::SceneFrame;

@@ -49,7 +49,7 @@ struct Moment {
 
 /// Entry of a scene frame in the timeline.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
-pub struct MomentSummary {
+pub(crate) struct MomentSummary {
     /// Capture time on the scene's clock, seconds.
     pub capture_s: f64,
     /// From the publication of the tick to that of its detections, milliseconds; `None` without detections.
@@ -121,7 +121,7 @@ impl RecordedRun {
     }
 
     /// Entries of the timeline.
-    pub fn timeline(&self) -> impl Iterator<Item = &MomentSummary> {
+    pub(crate) fn timeline(&self) -> impl Iterator<Item = &MomentSummary> {
         self.moments.iter().map(|moment| &moment.summary)
     }
 

@@ -18,6 +18,7 @@ use protocol::{
 use recording::{RecordingOptions, RecordingWriter};
 use serde_json::Value;
 
+use super::frame_assembler::{FrameAssembler, ReceivedMessage};
 use super::*;
 
 const EGO: &str = "4279";

@@ -24,7 +24,7 @@ pub static METHOD: MethodSpec = MethodSpec {
 /// Settings of [`AttentionFusion`]: none.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct AttentionConfig {}
+pub(crate) struct AttentionConfig {}
 
 impl FusionSettings for AttentionConfig {
     const KIND: &'static str = "attention";

@@ -18,7 +18,7 @@ const BASIS: i64 = 5;
 
 /// Mixes the channels of neighbours: `f + sum_k basis_k(heading) * W_k f`, then ReLU as after the encoder.
 #[derive(Debug)]
-pub struct ChannelMixing {
+pub(crate) struct ChannelMixing {
     /// `[BASIS, C, C]`.
     weight: Tensor,
 }
@@ -26,7 +26,7 @@ pub struct ChannelMixing {
 impl ChannelMixing {
     /// Changes nothing before it is trained; its parameter is `steering.weight`, `[5, C, C]`, under `path`.
     #[must_use]
-    pub fn new(path: &nn::Path<'_>, channels: i64) -> Self {
+    pub(crate) fn new(path: &nn::Path<'_>, channels: i64) -> Self {
         let weight = (path / "steering").var("weight", &[BASIS, channels, channels], Init::Const(0.0));
         Self { weight }
     }
@@ -36,7 +36,7 @@ impl ChannelMixing {
     ///
     /// # Errors
     /// [`TchError`] when the channels differ from its own, or there is not one pose per feature map.
-    pub fn turn(&self, features: &Tensor, ego_from_cav: &[Pose]) -> Result<Tensor, TchError> {
+    pub(crate) fn turn(&self, features: &Tensor, ego_from_cav: &[Pose]) -> Result<Tensor, TchError> {
         let mut turned = Vec::with_capacity(ego_from_cav.len());
         for (index, pose) in ego_from_cav.iter().enumerate() {
             let map = features.f_narrow(0, index as i64, 1)?;

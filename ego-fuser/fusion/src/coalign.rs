@@ -27,7 +27,7 @@ pub static METHOD: MethodSpec = MethodSpec {
 /// Settings of CoAlign.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
-pub struct CoAlignConfig {
+pub(crate) struct CoAlignConfig {
     /// Operation that fuses the features of a cell.
     pub aggregation: Aggregation,
     /// Value of cells that were not received.
@@ -47,7 +47,7 @@ impl Default for CoAlignConfig {
 impl CoAlignConfig {
     /// The fusion, which has no parameters.
     #[must_use]
-    pub fn fusion(&self) -> Where2comm {
+    pub(crate) fn fusion(&self) -> Where2comm {
         Where2comm::new(&Where2commConfig { aggregation: self.aggregation, missing: self.missing })
     }
 }

@@ -59,7 +59,7 @@ impl Linear {
 
 /// Normalisation over the channels of each token.
 #[derive(Debug)]
-pub struct LayerNorm {
+pub(crate) struct LayerNorm {
     weight: Tensor,
     bias: Tensor,
 }
@@ -67,7 +67,7 @@ pub struct LayerNorm {
 impl LayerNorm {
     /// `weight` and `bias`, `[channels]`, below `path`.
     #[must_use]
-    pub fn new(path: &nn::Path<'_>, channels: i64) -> Self {
+    pub(crate) fn new(path: &nn::Path<'_>, channels: i64) -> Self {
         let weight = path.var("weight", &[channels], Init::Const(1.0));
         Self { weight, bias: path.var("bias", &[channels], Init::Const(0.0)) }
     }
@@ -76,14 +76,14 @@ impl LayerNorm {
     ///
     /// # Errors
     /// [`TchError`] when the number of channels differs.
-    pub fn forward(&self, x: &Tensor) -> Result<Tensor, TchError> {
+    pub(crate) fn forward(&self, x: &Tensor) -> Result<Tensor, TchError> {
         x.f_layer_norm(self.weight.size(), Some(&self.weight), Some(&self.bias), EPSILON, false)
     }
 }
 
 /// Two linear layers with GELU between them: `net.0` and `net.3`.
 #[derive(Debug)]
-pub struct FeedForward {
+pub(crate) struct FeedForward {
     wide: Linear,
     back: Linear,
     dropout: f64,
@@ -92,7 +92,7 @@ pub struct FeedForward {
 impl FeedForward {
     /// From `channels` to `hidden` and back.
     #[must_use]
-    pub fn new(path: &nn::Path<'_>, channels: i64, hidden: i64, dropout: f64) -> Self {
+    pub(crate) fn new(path: &nn::Path<'_>, channels: i64, hidden: i64, dropout: f64) -> Self {
         let net = path / "net";
         let wide = Linear::new(&(&net / 0), channels, hidden, true);
         Self { wide, back: Linear::residual(&(&net / 3), hidden, channels, true), dropout }
@@ -102,7 +102,7 @@ impl FeedForward {
     ///
     /// # Errors
     /// [`TchError`] when the number of channels differs.
-    pub fn forward(&self, x: &Tensor, train: bool) -> Result<Tensor, TchError> {
+    pub(crate) fn forward(&self, x: &Tensor, train: bool) -> Result<Tensor, TchError> {
         let hidden = dropout(self.wide.forward(x)?.f_gelu("none")?, self.dropout, train)?;
         dropout(self.back.forward(&hidden)?, self.dropout, train)
     }
@@ -125,7 +125,7 @@ pub fn dropout(x: Tensor, share: f64, train: bool) -> Result<Tensor, TchError> {
 ///
 /// # Errors
 /// [`TchError`] when shapes do not fit.
-pub fn attend(query: &Tensor, key: &Tensor, value: &Tensor, bias: Option<&Tensor>) -> Result<Tensor, TchError> {
+pub(crate) fn attend(query: &Tensor, key: &Tensor, value: &Tensor, bias: Option<&Tensor>) -> Result<Tensor, TchError> {
     let (groups, tokens, heads, channels) = query.size4()?;
     let [query, key, value] = [query.f_transpose(1, 2)?, key.f_transpose(1, 2)?, value.f_transpose(1, 2)?];
     let seen = match bias {

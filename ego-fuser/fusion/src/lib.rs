@@ -36,7 +36,7 @@ pub mod swap_fusion;
 pub mod targets;
 #[cfg(test)]
 pub(crate) mod test_data;
-pub mod traf_align;
+pub(crate) mod traf_align;
 pub mod v2vnet;
 pub mod v2xvit;
 pub mod warp;
@@ -44,11 +44,9 @@ pub mod where2comm;
 
 pub use attention::AttentionFusion;
 pub use block_order::BlockOrder;
-pub use channel_mixing::ChannelMixing;
 pub use interface::{Fusion, FusionOutput};
 pub use maps::{AlignedMaps, EarlierMaps, MapMetadata, ReceivedMaps, regroup};
 pub use max::MaxFusion;
 pub use method::Method;
-pub use own::NoFusion;
 pub use settings::{FUSION_KEY, FusionConfig, FusionSettings, HistorySpec, Requirements};
 pub use spec::{Exchange, FusionSpec, MethodSpec};

@@ -23,7 +23,7 @@ pub static METHOD: MethodSpec = MethodSpec {
 /// Settings of [`MaxFusion`]: none.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct MaxConfig {}
+pub(crate) struct MaxConfig {}
 
 impl FusionSettings for MaxConfig {
     const KIND: &'static str = "max";

@@ -116,7 +116,7 @@ impl Method {
 
     /// True if the settings belong to its fusion.
     #[must_use]
-    pub fn has_fusion(self, config: &FusionConfig) -> bool {
+    pub(crate) fn has_fusion(self, config: &FusionConfig) -> bool {
         self.0.fusion.kind == config.kind()
     }
 }

@@ -42,7 +42,7 @@ pub static EARLY: MethodSpec = MethodSpec {
 /// Settings of [`NoFusion`]: none.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct OwnConfig {}
+pub(crate) struct OwnConfig {}
 
 impl FusionSettings for OwnConfig {
     const KIND: &'static str = "own";
@@ -58,7 +58,7 @@ impl FusionSettings for OwnConfig {
 
 /// The ego's own feature map, whatever the others send.
 #[derive(Debug, Clone, Copy, Default)]
-pub struct NoFusion;
+pub(crate) struct NoFusion;
 
 impl Fusion for NoFusion {
     fn fuse(&self, maps: &AlignedMaps) -> Result<FusionOutput, TchError> {

@@ -343,7 +343,7 @@ impl Evaluator {
 
 /// The vehicles that lie completely over the area of a detector, as annotated by all agents within 70 m.
 #[must_use]
-pub fn rule_for(config: &DetectorConfig) -> GroundTruthRule {
+pub(crate) fn rule_for(config: &DetectorConfig) -> GroundTruthRule {
     let [x_low, y_low, z_low, x_high, y_high, z_high] = config.lidar_range_m;
     GroundTruthRule {
         x_m: [x_low, x_high],

@@ -2,7 +2,9 @@ use agent::agent::{Agent, AgentInput};
 use localization::pose_source::RecordedPose;
 use perception::model_config::DetectorConfig;
 use perception::pillars::point_pillars::PointPillars;
-use protocol::{CavId, CodecConfig, ConfidenceGate, Limits, NoPoseReason, PointCloud, PoseEstimate, encode_features};
+use protocol::{
+    CavId, CodecConfig, ConfidenceGate, EgoMotion, Limits, NoPoseReason, PointCloud, PoseEstimate, encode_features,
+};
 use tch::Device;
 use tch::nn::VarStore;
 
@@ -63,7 +65,12 @@ fn view_by(detector: Detector, name: &str, world_from_cav: Pose, method: Method,
     let cav = CavId::new(name).unwrap();
     let mut agent = Agent::new(cav.clone(), Box::new(RecordedPose), detector);
     let cloud = cloud(phase);
-    let input = AgentInput { capture_nanos: 0, cloud: &cloud, measured_pose: Some(&world_from_cav) };
+    let input = AgentInput {
+        capture_nanos: 0,
+        cloud: &cloud,
+        measured_pose: Some(&world_from_cav),
+        motion: EgoMotion::default(),
+    };
     let output = agent.process(&input).unwrap();
     let content = match method.own_content() {
         Exchange::Boxes => Content::Boxes(output.perception.detections),

@@ -38,6 +38,8 @@ impl Node<'_> {
         if *cav == self.cav {
             self.keep_time(capture_nanos);
             let agent_frame = arrival.header.stamp.sequence;
+            let has_waited = !self.frames.is_empty();
+            self.pace.iter_mut().for_each(|pace| pace.judge(capture_nanos, has_waited));
             self.frames.push_back(OwnFrame { agent_frame, capture_nanos, transport, begun: arrival.at, view });
             return;
         }

@@ -6,6 +6,7 @@
 
 mod admit;
 mod decide;
+mod pace_keeper;
 
 use std::collections::{BTreeSet, VecDeque};
 use std::sync::Arc;
@@ -16,12 +17,13 @@ use bus::shutdown::Stop;
 use bus::{Bus, BusError, Event, Inbox, InboxLimits, Publisher, PublisherOptions, Subscription};
 use protocol::{CavId, DropReason, Limits, Role, Stream, Topic};
 
-use crate::config::{EgoConfig, EgoSettings};
+use crate::config::{EgoConfig, EgoSettings, PaceMode};
 use crate::ego::{Ego, View};
 use crate::neighbourhood::{Neighbourhood, sender_of, topic_of};
 use crate::pairing::{Pairing, PairingConfig};
 use crate::peer_models::PeerModels;
 use fusion::method::Exchange;
+use pace_keeper::PaceKeeper;
 
 /// Messages of one sender that may wait while a frame is fused. An ego that needs longer than its frames' period
 /// answers frames that have waited this long, so it is no more than a short pause needs.
@@ -48,6 +50,8 @@ pub struct NodeOptions {
     pub over_link: bool,
     /// True to continue when the own agent has ended, for its next instance.
     pub keeps_running: bool,
+    /// True to slow the fleet down where this machine cannot keep up.
+    pub sets_pace: bool,
     /// Limits of received messages.
     pub limits: Limits,
     /// Limits of the inbox, for each sender and in total.
@@ -70,6 +74,7 @@ impl From<&EgoSettings> for NodeOptions {
             neighbours: None,
             over_link: false,
             keeps_running: false,
+            sets_pace: settings.pace == PaceMode::Auto,
             limits: Limits::DEFAULT,
             inbox: settings.inbox.limits(),
         }
@@ -106,10 +111,15 @@ pub struct NodeReport {
 /// # Errors
 /// [`BusError`] of the bus. Errors of single messages are counted and logged.
 pub fn run(bus: &Bus, cav: &CavId, ego: Ego, options: &NodeOptions, stop: &Stop) -> Result<NodeReport, BusError> {
+    let mut ego = ego;
+    if let Err(error) = ego.warm_up(cav) {
+        tracing::warn!("the networks are not warmed up: {error}");
+    }
     let mut node = Node::open(bus, cav, ego, options, stop)?;
     let presence = bus.announce(Role::Ego)?;
     node.receive(stop)?;
-    let Node { detections, json, report, .. } = node;
+    let Node { detections, json, pace, report, .. } = node;
+    pace.into_iter().for_each(PaceKeeper::finish);
     detections.finish();
     json.finish();
     presence.withdraw()?;
@@ -145,6 +155,7 @@ struct Node<'a> {
     models: PeerModels,
     pairing: Pairing<Received>,
     frames: VecDeque<OwnFrame>,
+    pace: Option<PaceKeeper>,
     /// Capture time of the ego's newest sweep, nanoseconds.
     own_nanos: Option<u64>,
     ended: BTreeSet<CavId>,
@@ -179,6 +190,7 @@ impl<'a> Node<'a> {
             models: PeerModels::new(ego.detector()),
             pairing: Pairing::new(options.pairing),
             frames: VecDeque::new(),
+            pace: options.sets_pace.then(|| PaceKeeper::open(bus, cav)).transpose()?,
             own_nanos: None,
             ended: BTreeSet::new(),
             detections: bus.publisher(topic(Stream::Detections), PublisherOptions::DETECTIONS.waiting(RESULTS))?,
@@ -194,6 +206,7 @@ impl<'a> Node<'a> {
         let _working = self.bus.works_from(&self.inbox);
         while !stop.requested() {
             self.look_round()?;
+            self.pace.iter_mut().for_each(PaceKeeper::repeat);
             match self.inbox.take(Some(self.next_moment())) {
                 Pop::Item(_, Event::Message(arrival)) => self.admit(&arrival),
                 Pop::Item(topic, Event::End { .. }) if !self.options.keeps_running => {

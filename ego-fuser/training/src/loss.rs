@@ -149,7 +149,7 @@ pub fn detection_loss(
 ///
 /// # Errors
 /// [`TchError`] when a sample has other views than offsets.
-pub fn alignment_loss(corrections: &[Option<Tensor>], offsets: &[Vec<Offset>]) -> Result<Tensor, TchError> {
+pub(crate) fn alignment_loss(corrections: &[Option<Tensor>], offsets: &[Vec<Offset>]) -> Result<Tensor, TchError> {
     let unit = Tensor::f_from_slice(&[1.0, 1.0, METRES_PER_RADIAN as f32])?;
     let mut losses = Vec::new();
     for (moved_by, offsets) in corrections.iter().zip(offsets) {

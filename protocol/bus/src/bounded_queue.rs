@@ -66,7 +66,7 @@ impl<K: Ord + Clone, T> BoundedQueue<K, T> {
     }
 
     /// [`Self::push`] for a lane of another capacity than the others.
-    pub fn push_within(&self, lane_capacity: usize, key: K, item: T) -> PushOutcome<T> {
+    pub(crate) fn push_within(&self, lane_capacity: usize, key: K, item: T) -> PushOutcome<T> {
         let mut state = self.lock();
         let replaced = match self.make_lane(&mut state, &key, lane_capacity.max(1)) {
             Err(Full::Closed) => return PushOutcome::Closed(item),
@@ -79,7 +79,7 @@ impl<K: Ord + Clone, T> BoundedQueue<K, T> {
     }
 
     /// Appends `item` to its lane, waiting for room without a time limit.
-    pub fn push_waiting(&self, key: K, item: T) -> PushOutcome<T> {
+    pub(crate) fn push_waiting(&self, key: K, item: T) -> PushOutcome<T> {
         let mut state = self.lock();
         loop {
             match self.make_lane(&mut state, &key, self.lane_capacity) {

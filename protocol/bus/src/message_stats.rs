@@ -86,7 +86,7 @@ const BUCKETS_S: [f64; 14] =
 
 /// Durations of a stage, over all frames so far.
 #[derive(Debug, Clone, PartialEq)]
-pub struct StageHistogram {
+pub(crate) struct StageHistogram {
     /// Name of the stage.
     pub stage: String,
     /// Number of frames.
@@ -297,7 +297,7 @@ impl MessageStats {
 
     /// Histogram of every stage over all its frames.
     #[must_use]
-    pub fn histograms(&self) -> Vec<StageHistogram> {
+    pub(crate) fn histograms(&self) -> Vec<StageHistogram> {
         let state = self.lock();
         let ends = || BUCKETS_S.into_iter().chain([f64::MAX]);
         let histogram = |(stage, timings): (&String, &Timings)| StageHistogram {

@@ -15,14 +15,14 @@ use super::MessageStats;
 use crate::web::{Answer, WebServer};
 
 /// Serves the counters of a process at `http://<address>/metrics` until dropped.
-pub struct MetricsServer(WebServer);
+pub(crate) struct MetricsServer(WebServer);
 
 impl MetricsServer {
     /// Starts to serve `stats`; port 0: any free port.
     ///
     /// # Errors
     /// When the address cannot be bound.
-    pub fn start(address: SocketAddr, stats: &MessageStats) -> std::io::Result<Self> {
+    pub(crate) fn start(address: SocketAddr, stats: &MessageStats) -> std::io::Result<Self> {
         let stats = stats.clone();
         let server = WebServer::start(address, move |request| match request.path.as_str() {
             "/metrics" => Answer::Page { content_type: CONTENT_TYPE, body: exposition(&stats).into() },
@@ -33,7 +33,7 @@ impl MetricsServer {
 
     /// Address of the server.
     #[must_use]
-    pub fn address(&self) -> SocketAddr {
+    pub(crate) fn address(&self) -> SocketAddr {
         self.0.address()
     }
 }
@@ -42,7 +42,7 @@ const CONTENT_TYPE: &str = "application/openmetrics-text; version=1.0.0; charset
 
 /// The counters in the OpenMetrics text format.
 #[must_use]
-pub fn exposition(stats: &MessageStats) -> String {
+pub(crate) fn exposition(stats: &MessageStats) -> String {
     let process = (Cow::from("process"), Cow::from(stats.process().to_string()));
     let mut registry = Registry::with_prefix_and_labels("v2vloc", [process].into_iter());
     registry.register_collector(Box::new(StatsCollector(stats.clone())));

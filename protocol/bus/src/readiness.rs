@@ -145,7 +145,7 @@ impl Barrier {
     }
 
     /// Marks `route` as confirmed. Routes that are not expected change nothing.
-    pub fn confirm(&self, route: &Route) {
+    pub(crate) fn confirm(&self, route: &Route) {
         if self.lock().remove(route) {
             self.changed.notify_all();
         }

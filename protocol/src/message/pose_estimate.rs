@@ -18,6 +18,8 @@ pub enum PoseEstimate {
         world_from_cav: Pose,
         /// Confidence of the pose (sigma of the method), 0..=1.
         confidence: f32,
+        /// Covariance in the plane, for sources that have one: a pose tracker.
+        covariance: Option<PlanarCovariance>,
     },
     /// No pose was found.
     NoPose {
@@ -26,6 +28,49 @@ pub enum PoseEstimate {
         /// Number of inliers, if correspondences were searched.
         inlier_count: u32,
     },
+}
+
+/// Covariance of a pose in the plane of the world: position and yaw.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct PlanarCovariance {
+    /// Variance of x, square metres.
+    pub xx_m2: f32,
+    /// Covariance of x and y, square metres.
+    pub xy_m2: f32,
+    /// Variance of y, square metres.
+    pub yy_m2: f32,
+    /// Variance of the yaw, square radians.
+    pub yaw_rad2: f32,
+}
+
+/// Largest variance of a message: a standard deviation of a kilometre.
+const MAX_VARIANCE: f64 = 1e6;
+/// 95 % quantile of the chi-square distribution with two degrees of freedom.
+const CHI_SQUARE_95: f64 = 5.991;
+
+impl PlanarCovariance {
+    /// Variance of the position along its worst direction, square metres: the larger eigenvalue.
+    #[must_use]
+    pub fn worst_variance_m2(&self) -> f64 {
+        let [xx, xy, yy] = [self.xx_m2, self.xy_m2, self.yy_m2].map(f64::from);
+        let half_difference = (xx - yy) / 2.0;
+        f64::midpoint(xx, yy) + half_difference.hypot(xy)
+    }
+
+    /// Radius of the circle that holds the true position with a probability of at least 95 %, metres.
+    #[must_use]
+    pub fn bound_95_m(&self) -> f64 {
+        (CHI_SQUARE_95 * self.worst_variance_m2()).sqrt()
+    }
+
+    fn check_values(&self) -> Result<(), WireError> {
+        check_within("covariance xx_m2", self.xx_m2.into(), 0.0, MAX_VARIANCE)?;
+        check_within("covariance yy_m2", self.yy_m2.into(), 0.0, MAX_VARIANCE)?;
+        check_within("covariance yaw_rad2", self.yaw_rad2.into(), 0.0, MAX_VARIANCE)?;
+        // Rounding to single precision may exceed the bound by a little.
+        let bound = (f64::from(self.xx_m2) * f64::from(self.yy_m2)).sqrt() * (1.0 + 1e-5);
+        check_within("covariance xy_m2", self.xy_m2.into(), -bound, bound)
+    }
 }
 
 /// Reason why an agent has no pose.
@@ -45,10 +90,19 @@ pub enum NoPoseReason {
 }
 
 impl PoseEstimate {
-    /// A pose and its confidence.
+    /// A pose and its confidence, without a covariance.
     #[must_use]
     pub fn new(world_from_cav: Pose, confidence: f32) -> Self {
-        Self::Pose { world_from_cav, confidence }
+        Self::Pose { world_from_cav, confidence, covariance: None }
+    }
+
+    /// Covariance of the pose in the plane, if its source has one.
+    #[must_use]
+    pub fn covariance(&self) -> Option<&PlanarCovariance> {
+        match self {
+            Self::Pose { covariance, .. } => covariance.as_ref(),
+            Self::NoPose { .. } => None,
+        }
     }
 
     /// The pose, if there is one.
@@ -71,9 +125,10 @@ impl PoseEstimate {
 
     pub(super) fn check_values(&self, _: &Limits) -> Result<(), WireError> {
         match self {
-            Self::Pose { world_from_cav, confidence } => {
+            Self::Pose { world_from_cav, confidence, covariance } => {
                 check_pose("world_from_cav", world_from_cav)?;
-                check_within("confidence", f64::from(*confidence), 0.0, 1.0)
+                check_within("confidence", f64::from(*confidence), 0.0, 1.0)?;
+                covariance.as_ref().map_or(Ok(()), PlanarCovariance::check_values)
             }
             Self::NoPose { .. } => Ok(()),
         }
@@ -81,3 +136,33 @@ impl PoseEstimate {
 }
 
 metadata_only!(PoseEstimate, Pose);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_bound_is_that_of_the_worst_direction() {
+        // Two metres along the diagonal, half a metre across.
+        let (along, across) = (4.0_f32, 0.25_f32);
+        let covariance = PlanarCovariance {
+            xx_m2: f32::midpoint(along, across),
+            xy_m2: (along - across) / 2.0,
+            yy_m2: f32::midpoint(along, across),
+            yaw_rad2: 0.0,
+        };
+        assert!((covariance.worst_variance_m2() - 4.0).abs() < 1e-6);
+        assert!((covariance.bound_95_m() - 2.0 * 2.4477).abs() < 1e-3);
+        covariance.check_values().unwrap();
+    }
+
+    #[test]
+    fn a_covariance_that_is_none_is_rejected_by_its_field() {
+        let good = PlanarCovariance { xx_m2: 1.0, xy_m2: 0.5, yy_m2: 1.0, yaw_rad2: 0.1 };
+        let field = |covariance: PlanarCovariance| covariance.check_values().unwrap_err().to_string();
+        assert!(field(PlanarCovariance { xx_m2: -1.0, ..good }).contains("xx_m2"));
+        assert!(field(PlanarCovariance { xy_m2: 1.1, ..good }).contains("xy_m2"));
+        assert!(field(PlanarCovariance { yy_m2: f32::NAN, ..good }).contains("yy_m2"));
+        assert!(field(PlanarCovariance { yaw_rad2: f32::INFINITY, ..good }).contains("yaw_rad2"));
+    }
+}

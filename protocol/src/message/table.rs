@@ -5,7 +5,8 @@ use std::fmt;
 use serde::{Deserialize, Serialize};
 
 use super::{
-    Bev, Boxes, Control, Descriptor, Detections, Gnss, Lidar, Payload, Points, PoseEstimate, Radar, Stats, Truth,
+    Bev, Boxes, Control, Descriptor, Detections, EgoMotion, Gnss, Lidar, Pace, Payload, Points, PoseEstimate, Radar,
+    Stats, Truth,
 };
 use crate::WireError;
 
@@ -110,6 +111,10 @@ messages! {
     11 => Control(Control) = "control",
     /// Message counters and stage timings, any process to the operator.
     12 => Stats(Stats) = "stats",
+    /// Speed and yaw rate that a vehicle measures itself, replay to agent.
+    13 => Imu(EgoMotion) = "imu",
+    /// Sweeps that an ego has time for, ego to agents.
+    14 => Pace(Pace) = "pace",
 }
 
 #[cfg(test)]
@@ -125,7 +130,7 @@ mod tests {
         use crate::{Body, BodyShape, Limits, WireError};
 
         #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-        pub struct Ping {
+        pub(crate) struct Ping {
             pub count: u32,
         }
 

@@ -53,6 +53,15 @@ fn any_pose() -> impl Strategy<Value = Pose> {
         })
 }
 
+fn any_covariance() -> impl Strategy<Value = PlanarCovariance> {
+    (0f32..1e6, -1f32..1.0, 0f32..1e6, 0f32..10.0).prop_map(|(xx_m2, correlation, yy_m2, yaw_rad2)| PlanarCovariance {
+        xx_m2,
+        xy_m2: correlation * (xx_m2 * yy_m2).sqrt(),
+        yy_m2,
+        yaw_rad2,
+    })
+}
+
 fn any_estimate() -> impl Strategy<Value = PoseEstimate> {
     let reasons = vec![
         NoPoseReason::TooFewPoints,
@@ -63,6 +72,9 @@ fn any_estimate() -> impl Strategy<Value = PoseEstimate> {
     ];
     prop_oneof![
         (any_pose(), 0f32..=1.0).prop_map(|(pose, confidence)| PoseEstimate::new(pose, confidence)),
+        (any_pose(), 0f32..=1.0, any_covariance()).prop_map(|(world_from_cav, confidence, covariance)| {
+            PoseEstimate::Pose { world_from_cav, confidence, covariance: Some(covariance) }
+        }),
         (select(reasons), any::<u32>())
             .prop_map(|(reason, inlier_count)| PoseEstimate::NoPose { reason, inlier_count }),
     ]

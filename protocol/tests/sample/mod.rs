@@ -34,6 +34,14 @@ fn pose_at(translation_m: [f64; 3]) -> Pose {
     Pose { translation_m, rotation_wxyz: [0.8, 0.0, 0.0, 0.6] }
 }
 
+pub(crate) fn tracked_pose() -> PoseEstimate {
+    PoseEstimate::Pose {
+        world_from_cav: pose_at([120.5, -30.25, 1.75]),
+        confidence: 0.875,
+        covariance: Some(PlanarCovariance { xx_m2: 0.04, xy_m2: -0.01, yy_m2: 0.09, yaw_rad2: 0.0001 }),
+    }
+}
+
 pub(crate) fn pose() -> PoseEstimate {
     PoseEstimate::new(pose_at([120.5, -30.25, 1.75]), 0.875)
 }
@@ -143,6 +151,8 @@ pub(crate) fn every_kind() -> Vec<Message> {
         Message::Lidar(Lidar { points: points() }),
         Message::Lidar(Lidar::default()),
         Message::Radar(Radar { points: points() }),
+        Message::Pace(Pace { interval_nanos: 200_000_000, phase_nanos: 1_500_000_000 }),
+        Message::Imu(EgoMotion { speed_mps: Some(8.25), yaw_rate_rad_s: None }),
         Message::Gnss(Gnss {
             world_from_lidar: pose_at([1.0, 2.0, 3.0]),
             position_std_m: 0.4,
@@ -150,6 +160,7 @@ pub(crate) fn every_kind() -> Vec<Message> {
             source: GnssSource::Gnss,
         }),
         Message::Pose(pose()),
+        Message::Pose(tracked_pose()),
         Message::Pose(PoseEstimate::NoPose { reason: NoPoseReason::TooFewInliers, inlier_count: 4 }),
         Message::Boxes(Boxes { pose: pose(), detections: vec![detection(0.25); 5] }),
         Message::Points(Points { pose: pose(), points: points() }),

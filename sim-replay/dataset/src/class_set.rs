@@ -20,7 +20,7 @@ impl ClassSet {
     /// Cars, vans, trucks and buses.
     pub const VEHICLES: Self = Self(0b000_1111);
     /// Everything but pedestrians, as V2V4Real evaluates.
-    pub const ALL_BUT_PEDESTRIANS: Self = Self(0b101_1111);
+    pub(crate) const ALL_BUT_PEDESTRIANS: Self = Self(0b101_1111);
 
     /// True if a class is in the set.
     #[must_use]

@@ -71,7 +71,7 @@ impl ReadError {
 
     /// The same error with its consequence at the end of the reason.
     #[must_use]
-    pub fn with_consequence(mut self, consequence: &str) -> Self {
+    pub(crate) fn with_consequence(mut self, consequence: &str) -> Self {
         if let Self::Malformed { reason, .. } | Self::Layout { reason, .. } = &mut self {
             *reason = format!("{reason}: {consequence}");
         }

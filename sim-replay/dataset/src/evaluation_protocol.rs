@@ -14,7 +14,8 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 pub use config::ProtocolConfig;
-pub use preset::{PRESETS, preset_of_layout};
+pub use preset::PRESETS;
+pub(crate) use preset::preset_of_layout;
 
 use crate::Scenario;
 use crate::ground_truth::GroundTruthRule;

@@ -4,7 +4,7 @@
 
 use std::str::FromStr;
 
-use protocol::{CavId, Handedness, PointCloud, Pose};
+use protocol::{CavId, EgoMotion, Handedness, PointCloud, Pose};
 use serde::{Deserialize, Serialize};
 
 use crate::Problem;
@@ -38,7 +38,7 @@ impl ObjectClass {
 
     /// True for [`Self::VEHICLES`]. An object of unknown type is not a vehicle.
     #[must_use]
-    pub fn is_vehicle(self) -> bool {
+    pub(crate) fn is_vehicle(self) -> bool {
         Self::VEHICLES.contains(&self)
     }
 
@@ -107,6 +107,8 @@ pub struct Frame {
     pub gnss_world_from_vehicle: Option<Pose>,
     /// Forward speed in metres per second, if recorded. May be slightly negative.
     pub speed_mps: Option<f64>,
+    /// Yaw rate in radians per second, counter-clockwise, if recorded.
+    pub yaw_rate_rad_s: Option<f64>,
     /// Objects in this CAV's annotation. A CAV never lists itself.
     pub objects: Vec<Object>,
     /// All objects that the agents of the tick together are expected to find, if the data set has such a list; it is
@@ -119,6 +121,12 @@ pub struct Frame {
 }
 
 impl Frame {
+    /// Motion of the vehicle, as far as it is recorded.
+    #[must_use]
+    pub fn motion(&self) -> EgoMotion {
+        EgoMotion { speed_mps: self.speed_mps, yaw_rate_rad_s: self.yaw_rate_rad_s }
+    }
+
     /// An empty frame.
     #[must_use]
     pub fn empty(cav: CavId, capture_nanos: u64, source_handedness: Handedness) -> Self {
@@ -132,6 +140,7 @@ impl Frame {
             world_from_vehicle: None,
             gnss_world_from_vehicle: None,
             speed_mps: None,
+            yaw_rate_rad_s: None,
             objects: Vec::new(),
             cooperative_objects: None,
             problems: Vec::new(),

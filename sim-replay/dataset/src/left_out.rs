@@ -57,7 +57,7 @@ impl LeftOut {
     }
 
     /// Adds the parts left out of a frame.
-    pub fn add_parts(&mut self, frame: &Frame) {
+    pub(crate) fn add_parts(&mut self, frame: &Frame) {
         self.parts += frame.problems.len() as u64;
         frame.problems.iter().for_each(|problem| self.keep(problem.clone()));
     }

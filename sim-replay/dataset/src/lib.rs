@@ -62,7 +62,7 @@ use serde::Serialize;
 pub use error::ReadError;
 pub use layouts::{LAYOUTS, Layout, LayoutDescription, layouts_text};
 pub use left_out::LeftOut;
-pub use listing::{content_sha256, listing_sha256};
+pub use listing::content_sha256;
 pub use open::{OpenOptions, open, open_with};
 pub use points::{IntensityScale, IntensityScaleError, Plausibility};
 pub use presence::LoadedTick;

@@ -20,8 +20,8 @@ const MAX_ANNOTATION_BYTES: u64 = 32 << 20;
 
 /// SHA-256 over names, agents and capture times, in hexadecimal digits: independent of the path of the data set. No
 /// file is opened; see [`content_sha256`] for the contents.
-#[must_use]
-pub fn listing_sha256<'a>(scenarios: impl IntoIterator<Item = &'a Scenario>) -> String {
+#[cfg(test)]
+fn listing_sha256<'a>(scenarios: impl IntoIterator<Item = &'a Scenario>) -> String {
     let mut hash = Sha256::new();
     scenarios.into_iter().for_each(|scenario| list(scenario, &mut hash));
     digits(hash)

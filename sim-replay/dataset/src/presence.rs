@@ -60,7 +60,7 @@ impl Scenario {
     /// The scenario with some of its agents (indices), the first as the ego: its ticks are those at which that one has
     /// a frame.
     #[must_use]
-    pub fn arranged(&self, order: &[usize]) -> Self {
+    pub(crate) fn arranged(&self, order: &[usize]) -> Self {
         let agents: Vec<CavId> = order.iter().filter_map(|&index| self.agents.get(index).cloned()).collect();
         let is_kept = |frame: &&MissingFrame| agents.contains(&frame.agent);
         let missing: Vec<MissingFrame> = self.missing.iter().filter(is_kept).cloned().collect();

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use protocol::{CavId, Gnss, Handedness, Lidar, Limits, Payload, Radar, Stamp, Stream, Topic, Truth, wire};
+use protocol::{CavId, EgoMotion, Gnss, Handedness, Lidar, Limits, Payload, Radar, Stamp, Stream, Topic, Truth, wire};
 
 use super::presence::Absences;
 use super::{Dataset, FrameSource, Layout, MissingFrame, ReadError, Scenario, Tick};
@@ -66,7 +66,10 @@ impl Recorded {
         for entry in recording.entries() {
             let Stamp { capture_nanos, epoch, .. } = entry.header.stamp;
             match &entry.key.topic {
-                Topic::Stream { cav, stream: stream @ (Stream::Lidar | Stream::Gnss | Stream::Radar) } => {
+                Topic::Stream {
+                    cav,
+                    stream: stream @ (Stream::Lidar | Stream::Gnss | Stream::Imu | Stream::Radar),
+                } => {
                     sensors.entry((capture_nanos, cav.clone(), *stream)).or_insert_with(|| entry.clone());
                 }
                 Topic::Truth => match first_epochs.get(&capture_nanos) {
@@ -148,6 +151,10 @@ impl FrameSource for Recorded {
         if self.sensors.contains_key(&(tick.capture_nanos, agent.clone(), Stream::Gnss)) {
             let gnss: Gnss = self.sensor(agent, tick, Stream::Gnss)?;
             frame.world_from_lidar = Some(gnss.world_from_lidar);
+        }
+        if self.sensors.contains_key(&(tick.capture_nanos, agent.clone(), Stream::Imu)) {
+            let motion: EgoMotion = self.sensor(agent, tick, Stream::Imu)?;
+            (frame.speed_mps, frame.yaw_rate_rad_s) = (motion.speed_mps, motion.yaw_rate_rad_s);
         }
         Ok(frame)
     }

@@ -8,7 +8,7 @@ const SLOWEST: f64 = 1e-6;
 /// Mapping from scene time to the wall clock: running at a rate, or halted, possibly with some ticks still to be
 /// published.
 #[derive(Debug, Clone)]
-pub struct ReplayClock {
+pub(crate) struct ReplayClock {
     /// Seconds of the scene per second of the wall clock; 0: every tick is due at once.
     rate: f64,
     state: State,
@@ -25,19 +25,19 @@ enum State {
 impl ReplayClock {
     /// A running clock.
     #[must_use]
-    pub fn new(rate: f64) -> Self {
+    pub(crate) fn new(rate: f64) -> Self {
         Self { rate, state: State::Running, anchor: None }
     }
 
     /// Runs on from here, at another rate if one is given.
-    pub fn resume(&mut self, rate: Option<f64>) {
+    pub(crate) fn resume(&mut self, rate: Option<f64>) {
         self.rate = rate.unwrap_or(self.rate);
         self.state = State::Running;
         self.anchor = None;
     }
 
     /// Halts after the current tick.
-    pub fn pause(&mut self) {
+    pub(crate) fn pause(&mut self) {
         self.state = State::Halted { steps: 0 };
     }
 
@@ -47,7 +47,7 @@ impl ReplayClock {
     }
 
     /// Halts, but allows `ticks` more, each at once.
-    pub fn step(&mut self, ticks: u64) {
+    pub(crate) fn step(&mut self, ticks: u64) {
         let steps = match self.state {
             State::Halted { steps } => steps,
             State::Running => 0,
@@ -56,13 +56,13 @@ impl ReplayClock {
     }
 
     /// After a jump of the scene's time, or a wait: the next tick is due at once.
-    pub fn rebase(&mut self) {
+    pub(crate) fn rebase(&mut self) {
         self.anchor = None;
     }
 
     /// Time at which the tick captured at `capture_nanos` is due; `None` while the clock is halted.
     #[must_use]
-    pub fn due(&self, capture_nanos: u64, now: Instant) -> Option<Instant> {
+    pub(crate) fn due(&self, capture_nanos: u64, now: Instant) -> Option<Instant> {
         match (self.state, self.anchor) {
             (State::Halted { steps: 0 }, _) => None,
             (State::Running, Some((at, anchored))) if self.rate > 0.0 => {
@@ -75,7 +75,7 @@ impl ReplayClock {
 
     /// Records that the tick captured at `capture_nanos`, which was due at `due`, was published. Counting from the due
     /// time and not from now keeps the pace: a late tick does not delay those after it.
-    pub fn published(&mut self, capture_nanos: u64, due: Instant) {
+    pub(crate) fn published(&mut self, capture_nanos: u64, due: Instant) {
         match &mut self.state {
             State::Running => self.anchor = Some((due, capture_nanos)),
             State::Halted { steps } => *steps = steps.saturating_sub(1),

@@ -17,8 +17,7 @@ mod sensor_link;
 mod sensor_publisher;
 
 pub use checkpoint::{CheckpointError, Place};
-pub use clock::ReplayClock;
-pub use read_ahead::{ReadAhead, TickFrames};
+pub(crate) use clock::ReplayClock;
 pub use replay::{Replay, StreamError, StreamOptions};
 pub use report::{Lateness, StreamReport, Unreadable};
 pub use schedule::{Planned, Position, Schedule};

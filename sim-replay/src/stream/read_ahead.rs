@@ -9,7 +9,7 @@ use dataset::frame::Frame;
 use dataset::{LoadOptions, ReadError, Scenario};
 
 /// The frames of one tick, one for each requested agent, in that order.
-pub type TickFrames = Vec<Result<Frame, ReadError>>;
+pub(crate) type TickFrames = Vec<Result<Frame, ReadError>>;
 
 #[derive(Default)]
 struct State {
@@ -25,7 +25,7 @@ impl State {
 }
 
 /// A thread that reads the requested ticks, in order, and keeps no others.
-pub struct ReadAhead {
+pub(crate) struct ReadAhead {
     shared: Arc<(Mutex<State>, Condvar)>,
     thread: Option<JoinHandle<()>>,
 }
@@ -35,7 +35,7 @@ impl ReadAhead {
     ///
     /// # Errors
     /// If the system provides no thread.
-    pub fn start(scenario: Scenario, agents: Vec<usize>, options: LoadOptions) -> std::io::Result<Self> {
+    pub(crate) fn start(scenario: Scenario, agents: Vec<usize>, options: LoadOptions) -> std::io::Result<Self> {
         let shared: Arc<(Mutex<State>, Condvar)> = Arc::default();
         let thread = thread::Builder::new().name("read ahead".into()).spawn({
             let shared = Arc::clone(&shared);
@@ -55,7 +55,7 @@ impl ReadAhead {
     }
 
     /// Sets the ticks that will be taken next, in order; other frames that were read are dropped.
-    pub fn want(&self, ticks: &[usize]) {
+    pub(crate) fn want(&self, ticks: &[usize]) {
         let mut state = lock(&self.shared);
         state.wanted = ticks.iter().copied().collect();
         state.ready.retain(|tick, _| ticks.contains(tick));
@@ -64,7 +64,7 @@ impl ReadAhead {
 
     /// The frames of a requested tick, as soon as they are read; empty if the reading thread has ended.
     #[must_use]
-    pub fn take(&self, tick: usize) -> TickFrames {
+    pub(crate) fn take(&self, tick: usize) -> TickFrames {
         let mut state = lock(&self.shared);
         loop {
             if let Some(frames) = state.ready.remove(&tick) {

@@ -265,7 +265,7 @@ impl<'a> Replay<'a> {
 
     fn expected_routes(&self) -> Vec<Route> {
         let sensors = |cav: &CavId| {
-            [Stream::Lidar, Stream::Gnss].map(|stream| Route {
+            [Stream::Lidar, Stream::Gnss, Stream::Imu].map(|stream| Route {
                 topic: Topic::Stream { cav: cav.clone(), stream },
                 receiver: process_id(Role::Agent, cav),
             })

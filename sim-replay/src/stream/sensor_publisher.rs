@@ -16,6 +16,7 @@ const PREVIEW_POINTS: usize = 4_000;
 struct Sensors {
     lidar: Publisher,
     gnss: Publisher,
+    imu: Publisher,
     radar: Option<Publisher>,
     preview: Publisher,
 }
@@ -37,6 +38,7 @@ impl SensorPublisher {
                 // Small messages have other priorities than sweeps: they do not wait for one on its way to a slow receiver.
                 lidar: publisher(Stream::Lidar, PublisherOptions::SENSOR)?,
                 gnss: publisher(Stream::Gnss, PublisherOptions::POSE)?,
+                imu: publisher(Stream::Imu, PublisherOptions::POSE)?,
                 radar: with_radar.then(|| publisher(Stream::Radar, PublisherOptions::RADAR)).transpose()?,
                 preview: bus.publisher(
                     Topic::Stream { cav: cav.clone(), stream: Stream::Preview },
@@ -58,6 +60,11 @@ impl SensorPublisher {
             sensors.gnss.submit(capture_nanos, gnss);
             count(&mut self.sent, sensors.gnss.topic());
         }
+        let motion = frame.motion();
+        if !motion.is_empty() {
+            sensors.imu.submit(capture_nanos, motion);
+            count(&mut self.sent, sensors.imu.topic());
+        }
         if sensors.preview.is_wanted() {
             sensors.preview.submit(capture_nanos, Lidar { points: frame.points.decimate(PREVIEW_POINTS) });
         }
@@ -77,8 +84,11 @@ impl SensorPublisher {
 
     /// Sends queued messages and ends every topic; returns the number of submitted messages by topic.
     pub(super) fn finish(self) -> Vec<TopicCount> {
-        for Sensors { lidar, gnss, radar, preview } in self.sensors {
-            [Some(lidar), Some(gnss), radar, Some(preview)].into_iter().flatten().for_each(Publisher::finish);
+        for Sensors { lidar, gnss, imu, radar, preview } in self.sensors {
+            [Some(lidar), Some(gnss), Some(imu), radar, Some(preview)]
+                .into_iter()
+                .flatten()
+                .for_each(Publisher::finish);
         }
         self.truth.finish();
         self.sent

@@ -68,7 +68,7 @@ pub struct Findings {
 
 impl Findings {
     /// Adds the gaps between the results from `from_ms` to `to_ms`, during the fault `what`.
-    pub fn add_gaps(&mut self, results: &[Result], [from_ms, to_ms]: [u64; 2], period_ms: u64, what: &str) {
+    pub(crate) fn add_gaps(&mut self, results: &[Result], [from_ms, to_ms]: [u64; 2], period_ms: u64, what: &str) {
         let within = |result: &&Result| (from_ms..=to_ms).contains(&result.published_ms);
         let results: Vec<&Result> = results.iter().filter(within).collect();
         for pair in results.windows(2).filter(|pair| pair[0].epoch == pair[1].epoch) {
@@ -81,7 +81,7 @@ impl Findings {
     }
 
     /// Adds the times of the first message of restarted vehicles, by vehicle.
-    pub fn add_returns(&mut self, results: &[Result], first_message_ms: &BTreeMap<String, u64>) {
+    pub(crate) fn add_returns(&mut self, results: &[Result], first_message_ms: &BTreeMap<String, u64>) {
         for (cav, message_ms) in first_message_ms {
             let fused = results
                 .iter()

@@ -14,7 +14,7 @@ use support::random::derive_seed;
 pub use check::{Findings, Result, Results};
 pub use endurance::{ColdStart, Soak, cold_start, soak, write_scenario};
 pub use fleet::{FaultyFleet, Report};
-pub use proxy::Proxy;
+pub(crate) use proxy::Proxy;
 
 /// The vehicles; the first is the ego's.
 pub const VEHICLES: [&str; 4] = ["10", "20", "30", "40"];
@@ -63,7 +63,7 @@ pub struct Fault {
 impl Fault {
     /// True if no results can be expected of the ego meanwhile: its inputs are hit, or the connection to the scorer.
     #[must_use]
-    pub fn silences_ego(&self) -> bool {
+    pub(crate) fn silences_ego(&self) -> bool {
         let own = [format!("agent-{}", VEHICLES[0]), format!("ego-{}", VEHICLES[0]), "replay".into()];
         match &self.target {
             Target::Router => true,

@@ -15,7 +15,7 @@ use bus::Endpoint;
 const CHECK_PERIOD: Duration = Duration::from_millis(5);
 
 /// Forwards data between processes and router.
-pub struct Proxy {
+pub(crate) struct Proxy {
     /// Endpoint for the processes.
     pub endpoint: Endpoint,
     port: u16,
@@ -36,7 +36,7 @@ impl Proxy {
     /// # Panics
     /// When there is no free port.
     #[must_use]
-    pub fn open(router_port: u16) -> Self {
+    pub(crate) fn open(router_port: u16) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").expect("a free port");
         let port = listener.local_addr().expect("a bound socket has an address").port();
         let links = Arc::<Mutex<Vec<VirtualLink>>>::default();
@@ -55,12 +55,12 @@ impl Proxy {
     }
 
     /// Cuts the links of a process; returns their number.
-    pub fn cut(&self, pid: u32) -> usize {
+    pub(crate) fn cut(&self, pid: u32) -> usize {
         self.each(pid, |link| link.ends.iter().for_each(|end| drop(end.shutdown(Shutdown::Both))))
     }
 
     /// Silences a process's links, or ends that; returns their number.
-    pub fn silence(&self, pid: u32, is_silent: bool) -> usize {
+    pub(crate) fn silence(&self, pid: u32, is_silent: bool) -> usize {
         self.each(pid, |link| link.is_silent.store(is_silent, Ordering::Relaxed))
     }
 

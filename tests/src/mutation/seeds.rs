@@ -99,7 +99,7 @@ pub const V2V4REAL: &str = concat!(
 );
 
 /// A road, a junction, a crossing.
-pub const OPENDRIVE: &str = r#"<?xml version="1.0"?><OpenDRIVE><header revMajor="1" revMinor="4"/>
+pub(crate) const OPENDRIVE: &str = r#"<?xml version="1.0"?><OpenDRIVE><header revMajor="1" revMinor="4"/>
 <road name="a" length="40.0" id="1" junction="-1"><link><successor elementType="junction" elementId="9"/></link>
 <type s="0" type="town"><speed max="50" unit="km/h"/></type>
 <planView><geometry s="0" x="0" y="0" hdg="0" length="20"><line/></geometry>
@@ -127,7 +127,7 @@ pub const SCENARIO: &str = "run: test\nscene: {dir: scene, rate: 1.0, seek: 0, f
 pub const EXPERIMENT: &str = include_str!("../../../deploy/experiments/smoke.yaml");
 
 /// A link emulation.
-pub const LINK: &str = include_str!("../../../deploy/experiments/links/newest-first.yaml");
+pub(crate) const LINK: &str = include_str!("../../../deploy/experiments/links/newest-first.yaml");
 
 /// Tables of methods.
 pub const TABLES: &str = "dataset: scenes\nweights: weights\ndtype: f16\nframes: 40\ntables:\n- name: main\n  scenarios: 3\n  \
@@ -136,19 +136,19 @@ pub const TABLES: &str = "dataset: scenes\nweights: weights\ndtype: f16\nframes:
     - {name: noisy, poses: {noisy: {mode: independent, position_std_m: 1, heading_std_deg: 1}}}\n";
 
 /// A trace of a link.
-pub const TRACE: &str = "time_s,rate_mbps,delay_ms,loss\n0,27,10,0.01\n0.5,6,20.5,0\n1.25,0,100,1\n";
+pub(crate) const TRACE: &str = "time_s,rate_mbps,delay_ms,loss\n0,27,10,0.01\n0.5,6,20.5,0\n1.25,0,100,1\n";
 
 /// Departure times of packets, milliseconds.
-pub const MAHIMAHI: &str = "0\n1\n1\n5\n12\n40\n";
+pub(crate) const MAHIMAHI: &str = "0\n1\n1\n5\n12\n40\n";
 
 /// A checkpoint of a replay.
-pub const PLACE: &str = "{\"scenario\":\"town\",\"position\":{\"next_tick\":7,\"left\":12,\"shift_nanos\":1000000000,\
+pub(crate) const PLACE: &str = "{\"scenario\":\"town\",\"position\":{\"next_tick\":7,\"left\":12,\"shift_nanos\":1000000000,\
     \"last_nanos\":1600000000},\"is_halted\":false,\"ticks\":17,\"unanswered\":0,\"unreadable_frames\":1}\n";
 
 /// Poses of a localizer.
-pub const POSES: &str = "scenario,cav,capture_nanos,x_m,y_m,z_m,qw,qx,qy,qz,confidence,no_pose,inliers\n\
+pub(crate) const POSES: &str = "scenario,cav,capture_nanos,x_m,y_m,z_m,qw,qx,qy,qz,confidence,no_pose,inliers\n\
     town,1000,3000000000,258.3,296.2,1.99,0.712174537,0.000278377,0.000295992,-0.702002324,0.99,,\n\
     town,1000,3100000000,,,,,,,,,low_confidence,12\n";
 
 /// Errors of poses.
-pub const ERRORS: &str = "x_m,y_m,z_m,yaw_deg,confidence\n0.5,-0.25,0.1,1.5,0.9\n-1,2,0,-3,0.4\n";
+pub(crate) const ERRORS: &str = "x_m,y_m,z_m,yaw_deg,confidence\n0.5,-0.25,0.1,1.5,0.9\n-1,2,0,-3,0.4\n";

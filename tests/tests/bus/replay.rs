@@ -36,7 +36,7 @@ impl Listener {
         let inbox = buses[0].inbox(1000, 16);
         let mut subscriptions = vec![buses[0].subscribe(Topic::Truth, &inbox).unwrap()];
         for (bus, cav) in buses.iter().zip(AGENTS) {
-            for stream in [Stream::Lidar, Stream::Gnss] {
+            for stream in [Stream::Lidar, Stream::Gnss, Stream::Imu] {
                 subscriptions.push(bus.subscribe(topic(cav, stream), &inbox).unwrap());
             }
         }
@@ -47,7 +47,7 @@ impl Listener {
     fn captures(&self) -> BTreeMap<Topic, Vec<u64>> {
         let mut captures: BTreeMap<Topic, Vec<u64>> = BTreeMap::new();
         let mut ended = 0;
-        while ended < 5 {
+        while ended < 7 {
             match next_event(&self.inbox) {
                 (topic, Event::Message(arrival)) => {
                     captures.entry(topic).or_default().push(arrival.header.stamp.capture_nanos);
@@ -258,12 +258,15 @@ fn an_agent_that_does_not_come_is_named() {
     let agent = router.join("agent-10", "10");
     let inbox = agent.inbox(8, 8);
     let _subscriptions =
-        [Stream::Lidar, Stream::Gnss].map(|stream| agent.subscribe(topic("10", stream), &inbox).unwrap());
+        [Stream::Lidar, Stream::Gnss, Stream::Imu].map(|stream| agent.subscribe(topic("10", stream), &inbox).unwrap());
     let bus = router.join("replay", "replay");
     let options = StreamOptions { ready_timeout: Duration::from_millis(400), ..StreamOptions::default() };
     let replay = Replay::prepare(&bus, &scenario, options, &Stop::new()).unwrap();
     let error = replay.wait_until_ready().unwrap_err().to_string();
-    assert!(error.contains("20/lidar>agent-20, 20/gnss>agent-20") && !error.contains("10/"), "{error}");
+    assert!(
+        error.contains("20/lidar>agent-20, 20/gnss>agent-20, 20/imu>agent-20") && !error.contains("10/"),
+        "{error}"
+    );
 }
 
 #[test]

@@ -79,7 +79,12 @@ fn offline(folder: &Path, weights: &Path) -> (Vec<Vec<Detection>>, u64) {
             .map(|(index, agent)| {
                 let frame = scenario.load(index, tick, &LoadOptions::default()).unwrap();
                 let measured_pose = frame.world_from_lidar.as_ref();
-                let input = AgentInput { capture_nanos: frame.capture_nanos, cloud: &frame.points, measured_pose };
+                let input = AgentInput {
+                    capture_nanos: frame.capture_nanos,
+                    cloud: &frame.points,
+                    measured_pose,
+                    motion: frame.motion(),
+                };
                 let output = agent.process(&input).unwrap();
                 let features = output.perception.features;
                 bytes = 4 * features.values.len() as u64;

@@ -263,6 +263,7 @@ fn play_offline(scenario: &Scenario, method: Method) -> Vec<(u64, Vec<Detection>
                     capture_nanos: tick.capture_nanos,
                     cloud: &frame.points,
                     measured_pose: frame.world_from_lidar.as_ref(),
+                    motion: frame.motion(),
                 };
                 let output = agent.process(&input).unwrap();
                 let content = match method.own_content() {
@@ -359,6 +360,7 @@ impl ScriptedAgent {
             capture_nanos: tick.capture_nanos,
             cloud: &frame.points,
             measured_pose: frame.world_from_lidar.as_ref(),
+            motion: frame.motion(),
         };
         let output = self.agent.process(&input).unwrap();
         let pose = output.pose;
@@ -559,7 +561,12 @@ fn an_agent_receives_its_own_sensors_only_and_reports_a_missing_pose() {
         .filter(|(account, _)| account.to.is_some())
         .map(|(account, counts)| (account.topic.to_string(), counts.received))
         .collect();
-    assert_eq!(received, BTreeMap::from([("20/gnss".to_owned(), 0), ("20/lidar".to_owned(), 1)]));
+    assert_eq!(
+        received,
+        BTreeMap::from(
+            ["20/gnss", "20/imu", "20/lidar"].map(|topic| (topic.to_owned(), u64::from(topic == "20/lidar")))
+        )
+    );
     let sent = |stream| ledger.get(&Account::published(topic("20", stream))).unwrap().sent;
     assert_eq!((sent(Stream::Pose), sent(Stream::Bev)), (1, 1), "it reports that it has none");
 }

@@ -84,7 +84,10 @@ impl Neighbour {
         // Late enough for earlier times to exist.
         let capture_nanos = HOUR_NANOS + scenario.ticks[tick].capture_nanos;
         let measured_pose = frame.world_from_lidar.as_ref();
-        let output = self.agent.process(&AgentInput { capture_nanos, cloud: &frame.points, measured_pose }).unwrap();
+        let output = self
+            .agent
+            .process(&AgentInput { capture_nanos, cloud: &frame.points, measured_pose, motion: frame.motion() })
+            .unwrap();
         (capture_nanos, output.pose, output.perception.features)
     }
 

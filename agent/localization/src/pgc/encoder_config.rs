@@ -111,7 +111,7 @@ impl SceneEncoderConfig {
 
     /// Edge of the coarse cells of the last level, metres.
     #[must_use]
-    pub fn coarse_cell_m(&self) -> f64 {
+    pub(crate) fn coarse_cell_m(&self) -> f64 {
         self.voxel_m * f64::from(1 << (self.levels() - 1))
     }
 
@@ -123,7 +123,7 @@ impl SceneEncoderConfig {
 
     /// Channels of the last level.
     #[must_use]
-    pub fn coarse_channels(&self) -> i64 {
+    pub(crate) fn coarse_channels(&self) -> i64 {
         self.residual_widths.last().or(self.widths.last()).copied().unwrap_or(0)
     }
 

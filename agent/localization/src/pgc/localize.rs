@@ -3,6 +3,7 @@
 use std::path::Path;
 use std::time::{Duration, Instant};
 
+use nalgebra::{Isometry3, Vector3};
 use protocol::{PointCloud, PoseEstimate, StageTiming};
 use tch::nn::VarStore;
 use tch::{Device, Kind, TchError, Tensor, no_grad};
@@ -10,8 +11,9 @@ use tch::{Device, Kind, TchError, Tensor, no_grad};
 use super::confidence::{CONFIDENCE_KEY, Confidence, ConfidenceModel};
 use super::error::LocalizerError;
 use super::head_config::SceneHeadConfig;
+use super::levelling;
 use super::pose_evidence::PoseEvidence;
-use super::pose_refinement::SweepCells;
+use super::pose_refinement::{self, SweepCells};
 use super::pose_search::{PoseSearch, SearchTimes};
 use super::pose_solver::{self, FoundPose, PoseSolver, Solved};
 use super::scene_encoder::{SceneEncoder, SceneFeatures};
@@ -42,9 +44,11 @@ pub struct SceneCoordinates {
     pub origin_m: [f64; 3],
 }
 
-/// Scene coordinates, and the cells of the pose refinement: more of the same sweep.
-struct Regressed {
-    coordinates: SceneCoordinates,
+/// A sweep behind the encoder.
+struct EncodedSweep {
+    sweep: SweepVoxels,
+    features: SceneFeatures,
+    /// Cells of the pose refinement.
     refinement_cells: SweepCells,
 }
 
@@ -86,6 +90,20 @@ pub trait Localize: std::fmt::Debug + Send {
     /// [`LocalizerError::Tensor`] when the tensor library fails. A sweep that cannot be localized is no error but a
     /// result: [`PoseEstimate::NoPose`].
     fn localize(&mut self, cloud: &PointCloud) -> Result<Localization, LocalizerError>;
+
+    /// Localizes one sweep near a predicted pose `world_from_sensor`, which saves time if the sweep confirms it. By
+    /// default the prediction is not used.
+    ///
+    /// # Errors
+    /// As [`Self::localize`].
+    fn localize_near(
+        &mut self,
+        cloud: &PointCloud,
+        world_from_sensor: &Isometry3<f64>,
+    ) -> Result<Localization, LocalizerError> {
+        let _ = world_from_sensor;
+        self.localize(cloud)
+    }
 }
 
 /// Encoder, scene-specific head and solver.
@@ -158,38 +176,81 @@ impl Localizer {
     /// [`LocalizerError::Tensor`] when the tensor library fails.
     pub fn scene_coordinates(&self, cloud: &PointCloud) -> Result<(SceneCoordinates, LocalizerTimes), LocalizerError> {
         let mut times = LocalizerTimes::default();
-        let regressed = self.regress(cloud, &mut times)?;
-        Ok((regressed.map(|regressed| regressed.coordinates).unwrap_or_default(), times))
+        let coordinates = match self.encode(cloud, &mut times)? {
+            Some(encoded) => self.regress(&encoded, CELLS, &mut times)?,
+            None => SceneCoordinates::default(),
+        };
+        Ok((coordinates, times))
     }
 
-    /// `None` for a sweep without cells.
-    fn regress(&self, cloud: &PointCloud, times: &mut LocalizerTimes) -> Result<Option<Regressed>, LocalizerError> {
+    /// Cells and features; `None` for a sweep without cells.
+    fn encode(&self, cloud: &PointCloud, times: &mut LocalizerTimes) -> Result<Option<EncodedSweep>, LocalizerError> {
         let start = Instant::now();
         let points = cloud.xyzi.iter().map(|&[x, y, z, _]| [x, y, z]);
         let sweep = SweepVoxels::new(points, self.encoder.config());
-        let chosen = choose_evenly(sweep.cells(), self.head.config().max_cells.min(CELLS));
         times.voxelise = start.elapsed();
-        if chosen.is_empty() {
+        let refined = choose_evenly(sweep.cells(), REFINEMENT_CELLS);
+        if refined.is_empty() {
             return Ok(None);
         }
         let start = Instant::now();
         let batch = VoxelBatch::new(&[&sweep], self.encoder.config(), self.device)?;
         let features = self.encoder.encode(&batch, Kind::Float)?;
+        let refinement_cells = self.pick(&sweep, &features, &refined)?;
         times.encode = start.elapsed();
+        Ok(Some(EncodedSweep { sweep, features, refinement_cells }))
+    }
 
+    /// Scene coordinates of at most `count` cells (classification and Eq. 4).
+    fn regress(
+        &self,
+        encoded: &EncodedSweep,
+        count: usize,
+        times: &mut LocalizerTimes,
+    ) -> Result<SceneCoordinates, LocalizerError> {
+        let EncodedSweep { sweep, features, .. } = encoded;
         let start = Instant::now();
-        let SweepCells { features: cells, sensor_m } = self.pick(&sweep, &features, &chosen)?;
-        let refinement_cells = self.pick(&sweep, &features, &choose_evenly(sweep.cells(), REFINEMENT_CELLS))?;
+        let chosen = choose_evenly(sweep.cells(), self.head.config().max_cells.min(count));
+        let SweepCells { features: cells, sensor_m } = self.pick(sweep, features, &chosen)?;
         let (world, epsilon_m) = no_grad(|| -> Result<(Vec<f32>, Vec<f32>), TchError> {
             let logits = self.head.classify(&features.sweeps, false)?.f_expand([chosen.len() as i64, -1], false)?;
             let regression = self.head.regress(&self.head.normalise(&cells)?, &logits, Kind::Float)?;
             let world = Vec::try_from(&regression.coordinates_m.f_reshape([-1])?.f_to_device(Device::Cpu)?)?;
             Ok((world, Vec::try_from(&regression.epsilon_m.f_to_device(Device::Cpu)?)?))
         })?;
-        times.regress = start.elapsed();
+        times.regress += start.elapsed();
         let origin_m = self.head.config().origin_m;
-        let coordinates = SceneCoordinates { sensor_m, world_m: world.as_chunks().0.to_vec(), epsilon_m, origin_m };
-        Ok(Some(Regressed { coordinates, refinement_cells }))
+        Ok(SceneCoordinates { sensor_m, world_m: world.as_chunks().0.to_vec(), epsilon_m, origin_m })
+    }
+
+    /// Pose from the sweep alone.
+    fn search(&self, encoded: &EncodedSweep, mut times: LocalizerTimes) -> Result<Localization, LocalizerError> {
+        let coordinates = self.regress(encoded, CELLS, &mut times)?;
+        let search = PoseSearch { head: &self.head, solver: &self.solver, kind: Kind::Float };
+        let mut spent = SearchTimes::default();
+        let solved = search.run(&coordinates, &encoded.refinement_cells, &mut spent)?;
+        times.solve = spent.solve;
+        times.refine += spent.refine;
+        Ok(Localization::new(&solved, times))
+    }
+
+    /// Pose near a predicted one, from the pose refinement alone; `None` if the sweep does not confirm it.
+    fn refine(
+        &self,
+        encoded: &EncodedSweep,
+        world_from_sensor: &Isometry3<f64>,
+        times: &mut LocalizerTimes,
+    ) -> Result<Option<FoundPose>, LocalizerError> {
+        let origin_m = Vector3::from(self.head.config().origin_m);
+        let mut origin_from_sensor = *world_from_sensor;
+        origin_from_sensor.translation.vector -= origin_m;
+        let few = self.regress(encoded, levelling::CELLS, times)?;
+        let start = Instant::now();
+        let origin_from_sensor = levelling::level(&few, &origin_from_sensor);
+        let refined =
+            pose_refinement::refine(&self.head, &encoded.refinement_cells, &origin_from_sensor, false, Kind::Float)?;
+        times.refine = start.elapsed();
+        Ok(refined.and_then(|refined| pose_solver::confirm(&refined, &origin_from_sensor, &origin_m)))
     }
 
     fn pick(&self, sweep: &SweepVoxels, features: &SceneFeatures, chosen: &[usize]) -> Result<SweepCells, TchError> {
@@ -217,20 +278,43 @@ impl Localizer {
     /// result: [`PoseEstimate::NoPose`].
     pub fn localize(&self, cloud: &PointCloud) -> Result<Localization, LocalizerError> {
         let mut times = LocalizerTimes::default();
-        let Regressed { coordinates, refinement_cells } = match self.regress(cloud, &mut times)? {
-            Some(regressed) => regressed,
-            None => return Ok(Localization::new(&self.solver.solve(&SceneCoordinates::default()), times)),
+        match self.encode(cloud, &mut times)? {
+            Some(encoded) => self.search(&encoded, times),
+            None => Ok(Localization::new(&self.solver.solve(&SceneCoordinates::default()), times)),
+        }
+    }
+
+    /// The same with a predicted pose: if the sweep confirms it, few scene coordinates and no search are needed.
+    ///
+    /// # Errors
+    /// As [`Self::localize`].
+    pub fn localize_near(
+        &self,
+        cloud: &PointCloud,
+        world_from_sensor: &Isometry3<f64>,
+    ) -> Result<Localization, LocalizerError> {
+        let mut times = LocalizerTimes::default();
+        let Some(encoded) = self.encode(cloud, &mut times)? else {
+            return Ok(Localization::new(&self.solver.solve(&SceneCoordinates::default()), times));
         };
-        let search = PoseSearch { head: &self.head, solver: &self.solver, kind: Kind::Float };
-        let mut spent = SearchTimes::default();
-        let solved = search.run(&coordinates, &refinement_cells, &mut spent)?;
-        Ok(Localization::new(&solved, LocalizerTimes { solve: spent.solve, refine: spent.refine, ..times }))
+        match self.refine(&encoded, world_from_sensor, &mut times)? {
+            Some(found) => Ok(Localization::new(&Ok(found), times)),
+            None => self.search(&encoded, times),
+        }
     }
 }
 
 impl Localize for Localizer {
     fn localize(&mut self, cloud: &PointCloud) -> Result<Localization, LocalizerError> {
         Self::localize(self, cloud)
+    }
+
+    fn localize_near(
+        &mut self,
+        cloud: &PointCloud,
+        world_from_sensor: &Isometry3<f64>,
+    ) -> Result<Localization, LocalizerError> {
+        Self::localize_near(self, cloud, world_from_sensor)
     }
 }
 
@@ -258,7 +342,7 @@ impl Localization {
     #[must_use]
     pub fn from_estimate(estimate: PoseEstimate, times: LocalizerTimes) -> Self {
         let (found, inlier_count) = match estimate {
-            PoseEstimate::Pose { world_from_cav, confidence } => {
+            PoseEstimate::Pose { world_from_cav, confidence, .. } => {
                 let (world_from_sensor, sigma) = (world_from_cav.isometry(), f64::from(confidence));
                 let evidence = PoseEvidence::none();
                 (Some(FoundPose { world_from_sensor, evidence, sigma, is_rejected: false }), 0)

@@ -9,6 +9,7 @@ pub(crate) mod encoder_config;
 pub(crate) mod error;
 pub(crate) mod feature_norm;
 pub(crate) mod head_config;
+mod levelling;
 pub(crate) mod localize;
 mod pose_evidence;
 pub mod pose_refinement;

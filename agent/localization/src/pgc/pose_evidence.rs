@@ -1,5 +1,6 @@
 //! Evidence for a pose: statistics of the cells that it was estimated from.
 
+use nalgebra::Isometry3;
 use serde::{Deserialize, Serialize};
 
 use super::localize::{SceneCoordinates, sigma};
@@ -73,7 +74,25 @@ impl PoseEvidence {
             inlier_sigma: mean_over(&registration.inliers, &coordinates.epsilon_m, |epsilon| f64::from(sigma(epsilon))),
             position_std_m: std.position_m,
             rotation_std_rad: std.rotation_rad,
-            second: second.map(|second| RefinementEvidence::gather(registration, second)),
+            second: second.map(|second| RefinementEvidence::gather(&registration.target_from_source, second)),
+        }
+    }
+
+    /// Evidence of a pose that was refined from a predicted one, relative to the head's origin.
+    #[must_use]
+    pub(super) fn of_refinement(refined: &RefinedPose, start: &Isometry3<f64>) -> Self {
+        let second = RefinementEvidence::gather(start, refined);
+        Self {
+            cells: refined.epsilon_m.len(),
+            inliers: refined.registration.inliers.len(),
+            inlier_ratio: second.inlier_ratio,
+            rms_m: second.rms_m,
+            inlier_epsilon_m: mean_over(&refined.registration.inliers, &refined.epsilon_m, f64::from),
+            median_epsilon_m: second.median_epsilon_m,
+            inlier_sigma: second.inlier_sigma,
+            position_std_m: refined.std.position_m,
+            rotation_std_rad: refined.std.rotation_rad,
+            second: Some(second),
         }
     }
 
@@ -97,16 +116,16 @@ impl PoseEvidence {
     /// Confidence without calibration: mean confidence of the inliers, from the last stage, times the inlier ratio of
     /// the first one.
     #[must_use]
-    pub fn plain_sigma(&self) -> f64 {
+    pub(crate) fn plain_sigma(&self) -> f64 {
         let inlier_sigma = self.second.map_or(self.inlier_sigma, |second| second.inlier_sigma);
         (inlier_sigma * self.inlier_ratio).clamp(0.0, 1.0)
     }
 }
 
 impl RefinementEvidence {
-    fn gather(first: &Registration, second: &RefinedPose) -> Self {
+    fn gather(start: &Isometry3<f64>, second: &RefinedPose) -> Self {
         let RefinedPose { registration, epsilon_m, residual_quartile_m, std, information_per_m2 } = second;
-        let moved = registration.target_from_source.translation.vector - first.target_from_source.translation.vector;
+        let moved = registration.target_from_source.translation.vector - start.translation.vector;
         Self {
             inlier_ratio: registration.inlier_ratio,
             rms_m: registration.rms_m,

@@ -52,7 +52,7 @@ pub struct FoundPose {
 }
 
 /// The pose of one sweep, rejected or not, or the reason why there is none.
-pub type Solved = Result<FoundPose, NoRegistration>;
+pub(crate) type Solved = Result<FoundPose, NoRegistration>;
 
 impl PoseSolver {
     /// Solves one sweep.
@@ -107,6 +107,30 @@ impl PoseSolver {
         world_from_sensor.translation.vector += Vector3::from(coordinates.origin_m);
         FoundPose { world_from_sensor, evidence, sigma, is_rejected: self.confidence.rejects(sigma) }
     }
+}
+
+/// Smallest inlier ratio of a refined pose that confirms the prediction which it started from.
+const CONFIRMING_RATIO: f64 = 0.4;
+/// Factor on the standard deviation of a refined pose: errors of neighbouring cells are correlated.
+const CORRELATION_FACTOR: f64 = 4.0;
+/// Smallest error of a refined pose, metres: errors of one place repeat from sweep to sweep.
+const LEAST_ERROR_M: f64 = 0.04;
+
+/// The refined pose of a sweep whose pose was predicted as `start`, both relative to the head's origin; `None` if too
+/// few cells agree with it. Sigma follows from the standard deviation of the pose by Eq. 6.
+pub(super) fn confirm(refined: &RefinedPose, start: &Isometry3<f64>, origin_m: &Vector3<f64>) -> Option<FoundPose> {
+    let is_confirmed = refined.registration.inlier_ratio >= CONFIRMING_RATIO;
+    is_confirmed.then(|| {
+        let error_m = LEAST_ERROR_M.hypot(CORRELATION_FACTOR * refined.std.position_m);
+        let mut world_from_sensor = refined.registration.target_from_source;
+        world_from_sensor.translation.vector += origin_m;
+        FoundPose {
+            world_from_sensor,
+            evidence: PoseEvidence::of_refinement(refined, start),
+            sigma: 1.0 / (1.0 + error_m * error_m),
+            is_rejected: false,
+        }
+    })
 }
 
 /// The estimate of a sweep that is published.

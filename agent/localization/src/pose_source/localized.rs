@@ -90,7 +90,7 @@ impl PoseSource for LocalizedPose {
             }
         };
         match estimate {
-            PoseEstimate::Pose { world_from_cav, confidence } => {
+            PoseEstimate::Pose { world_from_cav, confidence, .. } => {
                 let verdict = self.motion_gate.judge(input.capture_nanos, &world_from_cav.isometry());
                 PoseEstimate::new(world_from_cav, confidence * self.motion_gate.factor(verdict) as f32)
             }
@@ -109,7 +109,7 @@ impl PoseSource for LocalizedPose {
 
 #[cfg(test)]
 mod tests {
-    use protocol::{CavId, PointCloud, Pose};
+    use protocol::{CavId, EgoMotion, PointCloud, Pose};
 
     use super::*;
     use crate::pgc::synthetic::SyntheticScene;
@@ -120,8 +120,13 @@ mod tests {
         let cloud = PointCloud::default();
         // A measured pose far off: it must not matter.
         let measured = Pose::from_xyz_yaw([1.0, 2.0, 3.0], 0.4);
-        let input =
-            |step| PoseInput { cav: &cav, capture_nanos: step * 100_000_000, cloud: &cloud, measured: Some(&measured) };
+        let input = |step| PoseInput {
+            cav: &cav,
+            capture_nanos: step * 100_000_000,
+            cloud: &cloud,
+            measured: Some(&measured),
+            motion: EgoMotion::default(),
+        };
         (0..count).map(|step| source.estimate(&input(step))).collect()
     }
 

@@ -11,19 +11,22 @@ mod noisy;
 mod numpy_normals;
 mod options;
 mod pose_table;
+mod tracked;
 
 use std::path::{Path, PathBuf};
 
 use protocol::config::{FieldError, within};
-use protocol::{CavId, NoPoseReason, PointCloud, Pose, PoseEstimate, StageTiming};
+use protocol::{CavId, EgoMotion, NoPoseReason, PointCloud, Pose, PoseEstimate, StageTiming};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 pub use error_table::{ErrorTable, ErrorTableError, TableRow};
 pub use localized::{EndToEndPoseConfig, LocalizedPose, PgcConfig};
-pub use noise::{PlanarError, PoseNoise};
+pub use noise::PlanarError;
 pub use noisy::NoisyPose;
-pub use pose_table::{CachedPose, CachedPoseConfig, PoseRow, PoseTable, PoseTableError};
+pub(crate) use pose_table::CachedPose;
+pub use pose_table::{CachedPoseConfig, PoseRow, PoseTable, PoseTableError};
+pub use tracked::{TrackedPose, TrackedPoseConfig};
 
 use crate::pgc::LocalizerError;
 
@@ -38,6 +41,8 @@ pub struct PoseInput<'a> {
     pub cloud: &'a PointCloud,
     /// `world_from_lidar` as recorded, or as a receiver measured it.
     pub measured: Option<&'a Pose>,
+    /// Speed and yaw rate of the vehicle at that time, where its sensors measure them.
+    pub motion: EgoMotion,
 }
 
 /// Source of an agent's pose.
@@ -45,7 +50,14 @@ pub trait PoseSource: std::fmt::Debug + Send {
     /// The pose of one sweep with its confidence, or the reason why there is none.
     fn estimate(&mut self, input: &PoseInput<'_>) -> PoseEstimate;
 
-    /// Durations of the stages of the last estimate, for sources that compute.
+    /// Second step of a sweep, after its pose and its feature map were published: measures for later sweeps. True if
+    /// the sweep was measured.
+    fn observe(&mut self, input: &PoseInput<'_>) -> bool {
+        let _ = input;
+        false
+    }
+
+    /// Durations of the stages of the last step, for sources that compute.
     fn stages(&self) -> &[StageTiming] {
         &[]
     }
@@ -83,6 +95,8 @@ pub enum PoseSourceConfig {
     Noisy(NoisyPoseConfig),
     /// Estimated from the sweep alone, by PGC.
     Pgc(PgcConfig),
+    /// Estimated by PGC and followed from sweep to sweep.
+    Tracked(TrackedPoseConfig),
     /// Estimated from the sweep alone, by a network that was trained end to end.
     EndToEnd(EndToEndPoseConfig),
     /// Read from a table that `agent localize` wrote.
@@ -192,6 +206,7 @@ impl PoseSourceConfig {
             Self::Recorded => "recorded",
             Self::Noisy(_) => "noisy",
             Self::Pgc(_) => "pgc",
+            Self::Tracked(_) => "tracked",
             Self::EndToEnd(_) => "end_to_end",
             Self::Cached(_) => "cached",
         }
@@ -205,6 +220,17 @@ impl PoseSourceConfig {
                 Self::Cached(CachedPoseConfig { scenario: Some(name.to_owned()), ..config.clone() })
             }
             other => other.clone(),
+        }
+    }
+
+    /// The same for one vehicle of several on one machine: those that are tracked measure in turn.
+    #[must_use]
+    pub fn with_turn(self, turn: u32) -> Self {
+        match self {
+            Self::Tracked(config) => {
+                Self::Tracked(TrackedPoseConfig { phase: config.phase.saturating_add(turn), ..config })
+            }
+            other => other,
         }
     }
 
@@ -225,6 +251,11 @@ impl PoseSourceConfig {
             Self::Pgc(pgc) => {
                 named("encoder", "--encoder", &pgc.encoder).and_then(|()| named("head", "--head", &pgc.head))
             }
+            Self::Tracked(tracked) => {
+                named("encoder", "--encoder", &tracked.encoder)?;
+                named("head", "--head", &tracked.head)?;
+                tracked.validate()
+            }
             Self::EndToEnd(network) => named("weights", "--end-to-end", &network.weights),
             Self::Cached(table) => named("file", "--poses", &table.file),
         }
@@ -237,6 +268,7 @@ impl PoseSourceConfig {
             Self::Recorded => vec![],
             Self::Noisy(noisy) => noisy.table.iter_mut().collect(),
             Self::Pgc(pgc) => vec![&mut pgc.encoder, &mut pgc.head],
+            Self::Tracked(tracked) => vec![&mut tracked.encoder, &mut tracked.head],
             Self::EndToEnd(network) => vec![&mut network.weights],
             Self::Cached(cached) => vec![&mut cached.file],
         };
@@ -251,6 +283,7 @@ impl PoseSourceConfig {
             Self::Recorded => vec![],
             Self::Noisy(noisy) => noisy.table.iter().map(PathBuf::as_path).collect(),
             Self::Pgc(pgc) => vec![&pgc.encoder, &pgc.head],
+            Self::Tracked(tracked) => vec![&tracked.encoder, &tracked.head],
             Self::EndToEnd(network) => vec![&network.weights],
             Self::Cached(cached) => vec![&cached.file],
         }
@@ -259,7 +292,7 @@ impl PoseSourceConfig {
     /// True if poses are estimated from the sweep's points.
     #[must_use]
     pub fn looks_at_sweeps(&self) -> bool {
-        matches!(self, Self::Pgc(_) | Self::EndToEnd(_))
+        matches!(self, Self::Pgc(_) | Self::Tracked(_) | Self::EndToEnd(_))
     }
 
     /// Sets the source up and reads its files.
@@ -272,6 +305,7 @@ impl PoseSourceConfig {
             Self::Recorded => Box::new(RecordedPose),
             Self::Noisy(config) => Box::new(NoisyPose::new(config)?),
             Self::Pgc(config) => Box::new(LocalizedPose::pgc(config)?),
+            Self::Tracked(config) => Box::new(TrackedPose::load(config)?),
             Self::EndToEnd(config) => Box::new(LocalizedPose::end_to_end(config)?),
             Self::Cached(config) => Box::new(CachedPose::new(config)?),
         })
@@ -287,7 +321,13 @@ mod tests {
         let cav = CavId::new("7").unwrap();
         let cloud = PointCloud::default();
         let pose = Pose::from_xyz_yaw([1.0, 2.0, 3.0], 0.4);
-        let mut input = PoseInput { cav: &cav, capture_nanos: 5, cloud: &cloud, measured: Some(&pose) };
+        let mut input = PoseInput {
+            cav: &cav,
+            capture_nanos: 5,
+            cloud: &cloud,
+            measured: Some(&pose),
+            motion: EgoMotion::default(),
+        };
         let mut source = PoseSourceConfig::default().build().unwrap();
         assert_eq!(source.estimate(&input), PoseEstimate::new(pose, 1.0));
         input.measured = None;

@@ -55,7 +55,7 @@ impl Default for MotionGateConfig {
 
 /// Classification of a pose, given those before it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Verdict {
+pub(crate) enum Verdict {
     /// The pose can be reached from the last accepted one, or there is none.
     Reachable,
     /// The pose cannot be reached.
@@ -72,7 +72,7 @@ struct TimedPose {
 
 /// Recent poses of a vehicle.
 #[derive(Debug, Clone)]
-pub struct MotionGate {
+pub(crate) struct MotionGate {
     config: MotionGateConfig,
     /// Accepted poses of the last seconds, oldest first.
     accepted: VecDeque<TimedPose>,
@@ -84,19 +84,19 @@ pub struct MotionGate {
 impl MotionGate {
     /// Gate without any pose.
     #[must_use]
-    pub fn new(config: MotionGateConfig) -> Self {
+    pub(crate) fn new(config: MotionGateConfig) -> Self {
         Self { config, accepted: VecDeque::new(), elsewhere: Vec::new(), jumps: 0 }
     }
 
     /// Number of jumps so far.
     #[must_use]
-    pub fn jumps(&self) -> u64 {
+    pub(crate) fn jumps(&self) -> u64 {
         self.jumps
     }
 
     /// Factor on the confidence of a pose with this verdict.
     #[must_use]
-    pub fn factor(&self, verdict: Verdict) -> f64 {
+    pub(crate) fn factor(&self, verdict: Verdict) -> f64 {
         match verdict {
             Verdict::Jump => self.config.penalty,
             Verdict::Reachable | Verdict::NewPlace => 1.0,
@@ -104,7 +104,7 @@ impl MotionGate {
     }
 
     /// Classifies a pose and stores it.
-    pub fn judge(&mut self, capture_nanos: u64, world_from_lidar: &Isometry3<f64>) -> Verdict {
+    pub(crate) fn judge(&mut self, capture_nanos: u64, world_from_lidar: &Isometry3<f64>) -> Verdict {
         let pose = TimedPose { capture_nanos, world_from_lidar: *world_from_lidar };
         let last = self.accepted.back().copied().filter(|last| self.remembers(last, &pose));
         let Some(last) = last else {

@@ -27,7 +27,7 @@ pub struct PlanarError {
 impl PlanarError {
     /// The pose with this error added to its position in the world and to its yaw, as the reference does.
     #[must_use]
-    pub fn added_in_world(&self, pose: &Pose) -> Pose {
+    pub(crate) fn added_in_world(&self, pose: &Pose) -> Pose {
         let exact = pose.isometry();
         let rotation = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), self.yaw_rad) * exact.rotation;
         let translation = exact.translation.vector + Vector3::from(self.position_m);
@@ -36,7 +36,7 @@ impl PlanarError {
 
     /// The pose with this error in the vehicle's frame: x forward, y left.
     #[must_use]
-    pub fn added_in_vehicle(&self, pose: &Pose) -> Pose {
+    pub(crate) fn added_in_vehicle(&self, pose: &Pose) -> Pose {
         let error = Isometry3::new(Vector3::from(self.position_m), Vector3::z() * self.yaw_rad);
         (pose.isometry() * error).into()
     }
@@ -50,7 +50,7 @@ impl PlanarError {
 
 /// Normal errors with the same standard deviations throughout.
 #[derive(Debug, Clone, PartialEq)]
-pub struct PoseNoise {
+pub(crate) struct PoseNoise {
     position_std_m: f64,
     yaw_std_rad: f64,
     seed: u64,
@@ -59,14 +59,14 @@ pub struct PoseNoise {
 impl PoseNoise {
     /// Errors with these standard deviations, metres per axis and radians.
     #[must_use]
-    pub fn new(position_std_m: f64, yaw_std_rad: f64, seed: u64) -> Self {
+    pub(crate) fn new(position_std_m: f64, yaw_std_rad: f64, seed: u64) -> Self {
         Self { position_std_m, yaw_std_rad, seed }
     }
 
     /// The constant error of all vehicles: to the digit the draw of OpenCOOD with this seed at every call. Of six
     /// normals, three are of the position, the fifth of the heading.
     #[must_use]
-    pub fn fixed(&self) -> PlanarError {
+    pub(crate) fn fixed(&self) -> PlanarError {
         let mut random = NumpyNormals::new(self.seed);
         let [x, y, z, _, yaw] = std::array::from_fn(|_| random.normal());
         self.scaled([x, y, z, yaw])
@@ -74,7 +74,7 @@ impl PoseNoise {
 
     /// The error of a vehicle at a step of time, independent of all others.
     #[must_use]
-    pub fn independent(&self, cav: &CavId, step: u64) -> PlanarError {
+    pub(crate) fn independent(&self, cav: &CavId, step: u64) -> PlanarError {
         self.scaled(draw(&self.random(cav), step))
     }
 
@@ -83,7 +83,7 @@ impl PoseNoise {
     /// `e_k = rho e_{k-1} + sqrt(1 - rho^2) n_k`, written out as the sum of the innovations `n` back to where they have
     /// decayed: so it depends on no earlier call, and frames may be lost, repeated or started anywhere.
     #[must_use]
-    pub fn autoregressive(&self, cav: &CavId, step: u64, rho: f64) -> PlanarError {
+    pub(crate) fn autoregressive(&self, cav: &CavId, step: u64, rho: f64) -> PlanarError {
         let random = self.random(cav);
         let depth = if rho > 0.0 { (NEGLIGIBLE.ln() / rho.ln()).ceil() as u64 } else { 0 };
         let mut sum = [0.0; 4];

@@ -120,7 +120,7 @@ mod tests {
     #[test]
     fn a_large_error_has_a_low_confidence() {
         for step in 0..20 {
-            let PoseEstimate::Pose { world_from_cav, confidence } =
+            let PoseEstimate::Pose { world_from_cav, confidence, .. } =
                 source(NoiseMode::Independent).disturbed(&cav("a"), step * 100_000_000, &TRUE_POSE)
             else {
                 panic!("a measured pose gives a pose")

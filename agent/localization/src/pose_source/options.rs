@@ -3,7 +3,7 @@
 use clap::{ArgMatches, Args, Command, FromArgMatches, ValueEnum};
 use protocol::config::{document, options_of};
 
-use super::{CachedPoseConfig, EndToEndPoseConfig, NoisyPoseConfig, PgcConfig, PoseSourceConfig};
+use super::{CachedPoseConfig, EndToEndPoseConfig, NoisyPoseConfig, PgcConfig, PoseSourceConfig, TrackedPoseConfig};
 
 /// Option that chooses the source.
 #[derive(Debug, clap::Args)]
@@ -23,6 +23,8 @@ enum Kind {
     Noisy,
     /// Estimated from the LiDAR sweep alone, by PGC.
     Pgc,
+    /// Estimated by PGC and followed from sweep to sweep.
+    Tracked,
     /// Estimated from the LiDAR sweep alone, by a network that was trained end to end.
     EndToEnd,
     /// Read from a table that `agent localize` wrote.
@@ -35,6 +37,7 @@ impl PoseSourceConfig {
             Self::Recorded => Kind::Recorded,
             Self::Noisy(_) => Kind::Noisy,
             Self::Pgc(_) => Kind::Pgc,
+            Self::Tracked(_) => Kind::Tracked,
             Self::EndToEnd(_) => Kind::EndToEnd,
             Self::Cached(_) => Kind::Cached,
         }
@@ -45,6 +48,7 @@ impl PoseSourceConfig {
             Kind::Recorded => Self::Recorded,
             Kind::Noisy => Self::Noisy(NoisyPoseConfig::default()),
             Kind::Pgc => Self::Pgc(PgcConfig::default()),
+            Kind::Tracked => Self::Tracked(TrackedPoseConfig::default()),
             Kind::EndToEnd => Self::EndToEnd(EndToEndPoseConfig::default()),
             Kind::Cached => Self::Cached(CachedPoseConfig::default()),
         }
@@ -68,6 +72,13 @@ impl FromArgMatches for PoseSourceConfig {
             Self::Recorded => Ok(()),
             Self::Noisy(noise) => noise.update_from_arg_matches(matches),
             Self::Pgc(networks) => networks.update_from_arg_matches(matches),
+            Self::Tracked(tracked) => {
+                let mut networks =
+                    PgcConfig { encoder: tracked.encoder.clone(), head: tracked.head.clone(), ..Default::default() };
+                networks.update_from_arg_matches(matches)?;
+                (tracked.encoder, tracked.head) = (networks.encoder, networks.head);
+                tracked.update_from_arg_matches(matches)
+            }
             Self::EndToEnd(network) => network.update_from_arg_matches(matches),
             Self::Cached(table) => table.update_from_arg_matches(matches),
         }
@@ -80,6 +91,9 @@ impl Args for PoseSourceConfig {
         let noise = serde_json::json!({ "noise": NoisyPoseConfig::default() });
         let command = document(command, options_of::<NoisyPoseConfig>(), &noise);
         let command = PgcConfig::augment_args_for_update(command);
+        let command = TrackedPoseConfig::augment_args_for_update(command);
+        let tracking = serde_json::json!({ "tracking": TrackedPoseConfig::default() });
+        let command = document(command, options_of::<TrackedPoseConfig>(), &tracking);
         let command = EndToEndPoseConfig::augment_args_for_update(command);
         CachedPoseConfig::augment_args_for_update(command)
     }

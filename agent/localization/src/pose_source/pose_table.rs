@@ -156,7 +156,7 @@ pub struct CachedPoseConfig {
 
 /// Looks up poses that were estimated before.
 #[derive(Debug, Clone)]
-pub struct CachedPose {
+pub(crate) struct CachedPose {
     poses: HashMap<SweepKey, PoseEstimate>,
 }
 
@@ -165,7 +165,7 @@ impl CachedPose {
     ///
     /// # Errors
     /// [`PoseTableError`] names the file and what is wrong with it.
-    pub fn new(config: &CachedPoseConfig) -> Result<Self, PoseTableError> {
+    pub(crate) fn new(config: &CachedPoseConfig) -> Result<Self, PoseTableError> {
         Ok(Self { poses: PoseTable::read(&config.file)?.of_scenario(config.scenario.as_deref())? })
     }
 }
@@ -187,7 +187,7 @@ fn fields(scenario: &str, row: &PoseRow<'_>) -> [String; 13] {
     let mut fields: [String; 13] = Default::default();
     fields[..3].clone_from_slice(&[scenario.to_owned(), cav.to_string(), capture_nanos.to_string()]);
     match estimate {
-        PoseEstimate::Pose { world_from_cav: Pose { translation_m, rotation_wxyz }, confidence } => {
+        PoseEstimate::Pose { world_from_cav: Pose { translation_m, rotation_wxyz }, confidence, .. } => {
             fields[3..6].clone_from_slice(&translation_m.map(|metres| format!("{metres:.5}")));
             fields[6..10].clone_from_slice(&rotation_wxyz.map(|part| format!("{part:.9}")));
             fields[10] = format!("{confidence:.6}");
@@ -254,7 +254,9 @@ mod tests {
         PoseTable::append(&file, "two", &[row(&a, 100, LOST)]).unwrap();
         let table = PoseTable::read(&file).unwrap();
         assert_eq!((table.len(), table.has("elsewhere/one"), table.has("three")), (3, true, false));
-        let PoseEstimate::Pose { world_from_cav, confidence } = table.get("one", &a, 100).unwrap() else { panic!() };
+        let PoseEstimate::Pose { world_from_cav, confidence, .. } = table.get("one", &a, 100).unwrap() else {
+            panic!()
+        };
         let apart = found().world_from_cav().unwrap().from_world(world_from_cav).isometry();
         assert!(apart.translation.vector.norm() < 1e-4 && apart.rotation.angle() < 1e-6 && *confidence == 0.875);
         assert_eq!(table.get("one", &b, 100), Some(&LOST));
@@ -266,7 +268,13 @@ mod tests {
         let mut source = config(Some("one")).build().unwrap();
         let cloud = PointCloud::default();
         let mut ask = |cav, capture_nanos| {
-            source.estimate(&PoseInput { cav, capture_nanos, cloud: &cloud, measured: Some(&Pose::IDENTITY) })
+            source.estimate(&PoseInput {
+                cav,
+                capture_nanos,
+                cloud: &cloud,
+                measured: Some(&Pose::IDENTITY),
+                motion: protocol::EgoMotion::default(),
+            })
         };
         assert_eq!((ask(&b, 100), ask(&b, 300)), (LOST, super::super::NO_SOURCE));
         assert!(config(None).build().unwrap_err().to_string().contains("2 scenarios"));

@@ -56,7 +56,7 @@ impl Correspondence {
 
     /// Distance between the target and the transformed source, metres.
     #[must_use]
-    pub fn residual_m(&self, target_from_source: &Isometry3<f64>) -> f64 {
+    pub(crate) fn residual_m(&self, target_from_source: &Isometry3<f64>) -> f64 {
         let moved = target_from_source * Point3::from(self.source_m.map(f64::from));
         (Vector3::from(self.target_m.map(f64::from)) - moved.coords).norm()
     }

@@ -19,7 +19,7 @@ const CONVERGED: f64 = 1e-4;
 ///
 /// # Errors
 /// [`Degenerate`] when the pairs near the motion do not constrain it.
-pub fn reweighted<I>(
+pub(crate) fn reweighted<I>(
     pairs: &I,
     start: &Isometry3<f64>,
     scales_m: impl IntoIterator<Item = f64>,
@@ -38,7 +38,7 @@ where
 ///
 /// # Errors
 /// See [`reweighted`].
-pub fn converge<I>(
+pub(crate) fn converge<I>(
     pairs: &I,
     start: &Isometry3<f64>,
     scale_m: f64,
@@ -62,7 +62,7 @@ where
 
 /// Robust kernel: factor on a pair's weight, 0..=1.
 #[must_use]
-pub fn forgiveness(residual_m: f64, scale_m: f64) -> f64 {
+pub(crate) fn forgiveness(residual_m: f64, scale_m: f64) -> f64 {
     let scaled = residual_m / scale_m;
     if scaled < CUTOFF_SCALES { (1.0 + scaled * scaled).powi(-2) } else { 0.0 }
 }

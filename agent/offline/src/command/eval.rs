@@ -4,8 +4,8 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use agent_offline::evaluation::{
-    Evaluated, EvaluatedSweep, EvaluationError, EvaluationOptions, LocalizationSummary, evaluate, evaluate_source,
-    reliability_charts, write_csv, write_error_table,
+    Evaluated, EvaluatedSweep, EvaluationError, EvaluationOptions, IntegritySummary, LocalizationSummary, evaluate,
+    evaluate_source, reliability_charts, write_csv, write_error_table,
 };
 use agent_offline::icp_map::{IcpMapPose, read_map};
 use anyhow::Context;
@@ -15,12 +15,14 @@ use localization::competitors::EndToEndLocalizer;
 use localization::pgc::confidence::{CONFIDENCE_KEY, Confidence, ConfidenceModel, FitReport, check_good_loss};
 use localization::pgc::pose_solver::{PoseSolver, Solver};
 use localization::pgc::{Localize, Localizer, LocalizerError};
-use localization::pose_source::PoseSource;
+use localization::pose_source::{PoseSource, TrackedPose, TrackedPoseConfig};
 use localization::registration::icp::IcpConfig;
 use localization::registration::ransac::RansacConfig;
 use localization::registration::sc2pcr::Sc2PcrConfig;
 use perception::train::cuda_device;
 use perception::weights::annotate;
+use protocol::config::Section;
+use serde_json::json;
 use support::output;
 use support::progress;
 use tch::Device;
@@ -62,6 +64,13 @@ pub(crate) struct Args {
     /// Distance between two sweeps on that point-cloud map, metres.
     #[arg(long, value_name = "METRES", default_value_t = 5.0, requires = "icp_map")]
     map_spacing: f64,
+    /// Follow each vehicle from sweep to sweep (pose source tracked), and localize every sweep by itself beside it;
+    /// files are written of the tracked poses.
+    #[arg(long, conflicts_with_all = ["end_to_end", "icp_map", "fit_confidence"])]
+    tracked: bool,
+    /// Settings of the tracker.
+    #[command(flatten)]
+    tracker: Section<TrackedPoseConfig>,
     /// Sweeps of another weather, if the data set has them, for example fog_0.060.
     #[arg(long, value_name = "NAME")]
     variant: Option<String>,
@@ -137,22 +146,31 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
         let count = groups.len();
         return Err(BadInput::new(format!("--fit-confidence fits one head, {count} are given")).into());
     }
-    let (mut sweeps, mut left_out) = (Vec::new(), LeftOut::default());
+    let (mut sweeps, mut tracked, mut left_out) = (Vec::new(), Vec::new(), LeftOut::default());
     for (head, scenes) in &groups {
         let evaluated = args.evaluate(args.subject(head)?, scenes)?;
         sweeps.extend(evaluated.sweeps);
         left_out.merge(&evaluated.left_out);
+        if args.tracked {
+            tracked.extend(args.evaluate(args.tracking(head)?, scenes)?.sweeps);
+        }
     }
     if let ([(head, _)], true) = (&groups[..], args.fit_confidence) {
         let report = args.fit(head, &mut sweeps)?;
         output::note(report_line(&report));
     }
-    args.write(&sweeps)?;
+    args.write(if args.tracked { &tracked } else { &sweeps })?;
     let summary = LocalizationSummary::of(&sweeps);
-    if args.json {
-        output::line(serde_json::to_string_pretty(&summary)?)?;
-    } else {
-        output::text(table(&summary))?;
+    let tracked = args.tracked.then(|| LocalizationSummary::of(&tracked));
+    match (&tracked, args.json) {
+        (Some(tracked), true) => {
+            output::line(serde_json::to_string_pretty(&json!({ "pgc": summary, "tracked": tracked }))?)?
+        }
+        (None, true) => output::line(serde_json::to_string_pretty(&summary)?)?,
+        (Some(tracked), false) => {
+            output::text(format!("every sweep by itself\n{}\ntracked\n{}", table(&summary), table(tracked)))?;
+        }
+        (None, false) => output::text(table(&summary))?,
     }
     Ok(left_out.print())
 }
@@ -172,6 +190,12 @@ impl Args {
         let config = IcpConfig::default();
         let map = read_map(&self.icp_map, self.map_spacing, &config).map_err(BadInput::of)?;
         Ok(Subject::Source(Box::new(IcpMapPose::new(Arc::new(map), config))))
+    }
+
+    fn tracking(&self, head: &Path) -> Result<Subject, BadInput> {
+        let config = TrackedPoseConfig { encoder: self.encoder(head), head: head.to_owned(), ..self.tracker.0.clone() };
+        config.validate().map_err(BadInput::of)?;
+        Ok(Subject::Source(Box::new(TrackedPose::load(&config).map_err(BadInput::of)?)))
     }
 
     fn localizer(&self, head: &Path, device: Device) -> Result<Box<dyn Localize>, LocalizerError> {
@@ -264,10 +288,11 @@ fn table(summary: &LocalizationSummary) -> String {
         format!("sweeps     {sweeps}, {no_pose} without a pose {:?}", summary.outcomes),
         format!("success    {} under 3 m, {} under 1 m", percent(summary.success_3m), percent(summary.success_1m)),
         format!(
-            "position   mean {} m, median {}, 95 % {}, largest {}",
+            "position   mean {} m, median {}, 95 % {}, 99 % {}, largest {}",
             number(summary.mean_m, 2),
             number(summary.p50_m, 3),
             number(summary.p95_m, 2),
+            number(summary.p99_m, 2),
             number(summary.max_m, 1)
         ),
         format!(
@@ -290,7 +315,13 @@ fn table(summary: &LocalizationSummary) -> String {
             rejected.bad,
             share(rejected.good_share)
         ),
-        format!("time       {} ms median: {}", number(total, 1), stages.join(", ")),
+        format!("time       {} ms median, {:.1} mean: {}", number(total, 1), summary.mean_ms, stages.join(", ")),
     ];
-    lines.join("\n") + "\n"
+    let integrity = summary.integrity.map(|IntegritySummary { exceeded_share, p50_bound_m, .. }| {
+        format!(
+            "integrity  {} of the errors exceed their bound of 95 % (median {p50_bound_m:.2} m)",
+            percent(exceeded_share)
+        )
+    });
+    lines.into_iter().chain(integrity).collect::<Vec<_>>().join("\n") + "\n"
 }

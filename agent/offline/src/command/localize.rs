@@ -90,8 +90,10 @@ impl Args {
                     }
                 };
                 let capture_nanos = frame.capture_nanos;
-                let input = PoseInput { cav, capture_nanos, cloud: &frame.points, measured: None };
+                let input =
+                    PoseInput { cav, capture_nanos, cloud: &frame.points, measured: None, motion: frame.motion() };
                 rows.push(PoseRow { cav, capture_nanos, estimate: source.estimate(&input) });
+                source.observe(&input);
             }
         }
         PoseTable::append(&self.out, &scenario.name, &rows)?;

@@ -10,7 +10,7 @@ use dataset::frame::Frame;
 use dataset::{self, LeftOut, LoadOptions, Problem, ReadError, Scenario};
 use protocol::{CavId, Pose, PoseEstimate};
 
-pub use summary::{CalibrationBin, LocalizationSummary, RejectionSummary, reliability_charts};
+pub use summary::{CalibrationBin, IntegritySummary, LocalizationSummary, RejectionSummary, reliability_charts};
 pub use table::{write_csv, write_error_table};
 
 use localization::pgc::LocalizerError;
@@ -80,7 +80,7 @@ impl EvaluatedSweep {
 
     /// Error of the pose that is published, if there is one.
     #[must_use]
-    pub fn told_error(&self) -> Option<PoseError> {
+    pub(crate) fn told_error(&self) -> Option<PoseError> {
         self.localization.estimate.world_from_cav().map(|pose| PoseError::between(pose, &self.truth))
     }
 
@@ -142,12 +142,12 @@ pub fn evaluate_source(
         let measured = frame.gnss_world_from_lidar();
         let Frame { cav, capture_nanos, points, .. } = frame;
         let start = Instant::now();
-        let input = PoseInput { cav, capture_nanos: *capture_nanos, cloud: points, measured: measured.as_ref() };
+        let (capture_nanos, motion) = (*capture_nanos, frame.motion());
+        let input = PoseInput { cav, capture_nanos, cloud: points, measured: measured.as_ref(), motion };
         let estimate = source.estimate(&input);
-        Ok(Localization::from_estimate(
-            estimate,
-            LocalizerTimes { solve: start.elapsed(), ..LocalizerTimes::default() },
-        ))
+        source.observe(&input);
+        let times = LocalizerTimes { solve: start.elapsed(), ..LocalizerTimes::default() };
+        Ok(Localization::from_estimate(estimate, times))
     };
     evaluate_with(&mut ask, options, on_sweep)
 }

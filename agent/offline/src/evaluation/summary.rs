@@ -29,6 +29,8 @@ pub struct LocalizationSummary {
     pub p50_m: Option<f64>,
     /// 95th percentile of the distance error, metres.
     pub p95_m: Option<f64>,
+    /// 99th percentile of the distance error, metres.
+    pub p99_m: Option<f64>,
     /// Largest distance error, metres.
     pub max_m: Option<f64>,
     /// Mean angle error, degrees.
@@ -54,8 +56,23 @@ pub struct LocalizationSummary {
     pub calibration: Vec<CalibrationBin>,
     /// Rejected poses, and the good ones among them.
     pub rejected: RejectionSummary,
+    /// Integrity of the covariances of published poses; absent if they have none.
+    pub integrity: Option<IntegritySummary>,
     /// Median milliseconds by stage; `total` is that of all stages of a sweep.
     pub ms: BTreeMap<String, f64>,
+    /// Mean milliseconds of all stages of a sweep.
+    pub mean_ms: f64,
+}
+
+/// Errors of published poses against the bounds that were published with them.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct IntegritySummary {
+    /// Number of poses with a covariance.
+    pub poses: usize,
+    /// Share of them whose planar error exceeds the bound of 95 %, 0..=1.
+    pub exceeded_share: f64,
+    /// Median of that bound, metres.
+    pub p50_bound_m: f64,
 }
 
 /// Poses of similar sigma.
@@ -115,6 +132,8 @@ impl LocalizationSummary {
         for sweep in sweeps {
             *outcomes.entry(outcome(&sweep.localization.estimate)).or_default() += 1;
         }
+        let total_ms: Vec<f64> =
+            sweeps.iter().map(|sweep| sweep.localization.times.total().as_secs_f64() * 1e3).collect();
         let gaps: Vec<f64> = calibration.iter().map(|bin| (bin.sigma - bin.observed).abs()).collect();
         Self {
             sweeps: sweeps.len(),
@@ -123,6 +142,7 @@ impl LocalizationSummary {
             mean_m: mean(&metres),
             p50_m: quantile(&metres, 0.5),
             p95_m: quantile(&metres, 0.95),
+            p99_m: quantile(&metres, 0.99),
             max_m: metres.last().copied(),
             mean_deg: mean(&degrees),
             p50_deg: quantile(&degrees, 0.5),
@@ -135,7 +155,9 @@ impl LocalizationSummary {
             calibration_error: mean(&gaps),
             calibration,
             rejected: rejected(&judged),
+            integrity: integrity(sweeps),
             ms: median_times(sweeps),
+            mean_ms: mean(&total_ms).unwrap_or(0.0),
         }
     }
 }
@@ -175,6 +197,25 @@ fn rejected(judged: &[Judged]) -> RejectionSummary {
         bad_share: share(&bad),
         good_share: share(&good),
     }
+}
+
+fn integrity(sweeps: &[EvaluatedSweep]) -> Option<IntegritySummary> {
+    let judged = |sweep: &EvaluatedSweep| {
+        let PoseEstimate::Pose { world_from_cav, covariance: Some(covariance), .. } = &sweep.localization.estimate
+        else {
+            return None;
+        };
+        let off = |axis: usize| world_from_cav.translation_m[axis] - sweep.truth.translation_m[axis];
+        Some((off(0).hypot(off(1)), covariance.bound_95_m()))
+    };
+    let judged: Vec<(f64, f64)> = sweeps.iter().filter_map(judged).collect();
+    let exceeded = judged.iter().filter(|(error_m, bound_m)| error_m > bound_m).count();
+    let bounds: Vec<f64> = judged.iter().map(|(_, bound_m)| *bound_m).collect();
+    Some(IntegritySummary {
+        poses: judged.len(),
+        exceeded_share: exceeded as f64 / judged.len() as f64,
+        p50_bound_m: median(&bounds)?,
+    })
 }
 
 fn median_times(sweeps: &[EvaluatedSweep]) -> BTreeMap<String, f64> {

@@ -97,7 +97,7 @@ fn error_table(sweeps: &[EvaluatedSweep]) -> String {
     let mut text = CsvText::new("x_m,y_m,z_m,yaw_deg,confidence");
     for sweep in sweeps {
         match &sweep.localization.estimate {
-            PoseEstimate::Pose { world_from_cav, confidence } => {
+            PoseEstimate::Pose { world_from_cav, confidence, .. } => {
                 let error: Pose = sweep.truth.isometry().inv_mul(&world_from_cav.isometry()).into();
                 let [x, y, z, yaw] = pose(&error);
                 text.row([x, y, z, yaw, format!("{confidence:.4}")]);

@@ -30,7 +30,7 @@ pub struct SweepAugmentation {
 
 /// Cached features of cells, with their regression targets.
 #[derive(Debug)]
-pub struct FeatureCache {
+pub(crate) struct FeatureCache {
     /// `[N, cell_channels]`, half precision.
     pub cells: Tensor,
     /// `[N]`: index of the sweep of each cell.
@@ -53,7 +53,7 @@ impl FeatureCache {
     ///
     /// # Errors
     /// [`LocalizerTrainError`] when a sweep cannot be read or encoded, or none has a pose.
-    pub fn build(
+    pub(crate) fn build(
         list: &Arc<SweepList>,
         encoder: &SceneEncoder,
         augmentation: SweepAugmentation,
@@ -99,13 +99,13 @@ impl FeatureCache {
 
     /// Number of sweeps.
     #[must_use]
-    pub fn sweep_count(&self) -> usize {
+    pub(crate) fn sweep_count(&self) -> usize {
         self.world_from_sensor.len()
     }
 
     /// Number of cells.
     #[must_use]
-    pub fn cell_count(&self) -> i64 {
+    pub(crate) fn cell_count(&self) -> i64 {
         self.sweep_of_cell.size()[0]
     }
 }

@@ -11,7 +11,7 @@ const ROUNDS: usize = 25;
 ///
 /// Starts with points far from each other (k-means++, Arthur and Vassilvitskii 2007); same seed, same result.
 #[must_use]
-pub fn kmeans(points: &[[f64; 3]], count: usize, seed: u64) -> (Vec<[f64; 3]>, Vec<usize>) {
+pub(crate) fn kmeans(points: &[[f64; 3]], count: usize, seed: u64) -> (Vec<[f64; 3]>, Vec<usize>) {
     let mut centres = spread(points, count.min(points.len()), seed);
     let mut labels = vec![0; points.len()];
     for _ in 0..ROUNDS {

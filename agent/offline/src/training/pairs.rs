@@ -56,7 +56,7 @@ pub struct Pair {
 
 /// Generator of pairs, each a function of the seed and its number.
 #[derive(Debug, Clone)]
-pub struct PairMaker {
+pub(crate) struct PairMaker {
     store: Arc<SweepStore>,
     config: SceneEncoderConfig,
     seed: u64,
@@ -70,7 +70,11 @@ impl PairMaker {
     ///
     /// # Errors
     /// [`LocalizerTrainError::NoPairs`] when no two sweeps overlap.
-    pub fn new(store: Arc<SweepStore>, config: SceneEncoderConfig, seed: u64) -> Result<Self, LocalizerTrainError> {
+    pub(crate) fn new(
+        store: Arc<SweepStore>,
+        config: SceneEncoderConfig,
+        seed: u64,
+    ) -> Result<Self, LocalizerTrainError> {
         let partners = partners(&store);
         let anchors: Vec<u32> = (0..)
             .zip(&partners)
@@ -85,7 +89,7 @@ impl PairMaker {
 
     /// Number of sweeps that have a partner.
     #[must_use]
-    pub fn anchors(&self) -> usize {
+    pub(crate) fn anchors(&self) -> usize {
         self.anchors.len()
     }
 
@@ -94,7 +98,7 @@ impl PairMaker {
     /// # Errors
     /// [`LocalizerTrainError::NoMatches`] when neighbouring sweeps have no matching cells, for example because they are
     /// empty.
-    pub fn pair(&self, number: u64) -> Result<Pair, LocalizerTrainError> {
+    pub(crate) fn pair(&self, number: u64) -> Result<Pair, LocalizerTrainError> {
         let mut rng = ChaCha8Rng::seed_from_u64(self.seed);
         rng.set_stream(number);
         for _ in 0..TRIES {

@@ -26,7 +26,7 @@ const ENOUGH_PASSES: usize = 2;
 /// It is not part of a checkpoint: a training that is resumed uses all sweeps again, and leaves none out before the end
 /// of a window that it has observed long enough itself.
 #[derive(Debug)]
-pub struct Redundancy {
+pub(crate) struct Redundancy {
     config: RedundancyConfig,
     class_of_sweep: Vec<usize>,
     weights: Vec<f32>,
@@ -38,25 +38,25 @@ pub struct Redundancy {
 impl Redundancy {
     /// Nothing dropped yet.
     #[must_use]
-    pub fn new(config: RedundancyConfig, class_of_sweep: Vec<usize>) -> Self {
+    pub(crate) fn new(config: RedundancyConfig, class_of_sweep: Vec<usize>) -> Self {
         let count = class_of_sweep.len();
         Self { config, class_of_sweep, weights: vec![1.0; count], recorded: vec![Vec::new(); count], windows_done: 0 }
     }
 
     /// Weight of each sweep; 0: not used.
     #[must_use]
-    pub fn weights(&self) -> &[f32] {
+    pub(crate) fn weights(&self) -> &[f32] {
         &self.weights
     }
 
     /// True if losses are recorded when this share of the training is done.
     #[must_use]
-    pub fn watches(&self, share_done: f64) -> bool {
+    pub(crate) fn watches(&self, share_done: f64) -> bool {
         self.config.windows.get(self.windows_done).is_some_and(|[from, to]| (*from..*to).contains(&share_done))
     }
 
     /// Records the losses of the cells of one pass: pairs of sweep and loss.
-    pub fn record(&mut self, losses: &[(usize, f32)]) {
+    pub(crate) fn record(&mut self, losses: &[(usize, f32)]) {
         let mut by_sweep = vec![Vec::new(); self.weights.len()];
         losses.iter().for_each(|&(sweep, loss)| by_sweep[sweep].push(loss));
         for (recorded, mut losses) in self.recorded.iter_mut().zip(by_sweep).filter(|(_, losses)| !losses.is_empty()) {
@@ -67,12 +67,12 @@ impl Redundancy {
 
     /// True if sweeps that were left out are to be used again now, without waiting for the end of a pass.
     #[must_use]
-    pub fn is_time_for_all(&self, share_done: f64) -> bool {
+    pub(crate) fn is_time_for_all(&self, share_done: f64) -> bool {
         share_done >= self.config.all_from && self.weights.iter().any(|&weight| weight != 1.0)
     }
 
     /// Updates the selection at the end of a pass. True if it has changed.
-    pub fn advance(&mut self, share_done: f64) -> bool {
+    pub(crate) fn advance(&mut self, share_done: f64) -> bool {
         let is_over = |redundancy: &Self| {
             redundancy.config.windows.get(redundancy.windows_done).is_some_and(|[_, to]| share_done >= *to)
         };

@@ -17,7 +17,7 @@ const UNIT_M: f32 = 0.01;
 
 /// One sweep.
 #[derive(Debug, Clone)]
-pub struct StoredSweep {
+pub(crate) struct StoredSweep {
     /// World that it was recorded in: index of its folder on the command line.
     pub world: usize,
     /// Index of its drive.
@@ -31,19 +31,19 @@ pub struct StoredSweep {
 impl StoredSweep {
     /// A sweep from points in metres.
     #[must_use]
-    pub fn new(world: usize, drive: usize, world_from_sensor: Isometry3<f64>, points: &[[f32; 4]]) -> Self {
+    pub(crate) fn new(world: usize, drive: usize, world_from_sensor: Isometry3<f64>, points: &[[f32; 4]]) -> Self {
         let stored = |point: &[f32; 4]| std::array::from_fn(|axis| (point[axis] / UNIT_M).round() as i16);
         Self { world, drive, world_from_sensor, points: points.iter().map(stored).collect() }
     }
 
     /// x, y, z of every point, metres in the sensor frame.
-    pub fn points(&self) -> impl Iterator<Item = [f32; 3]> + '_ {
+    pub(crate) fn points(&self) -> impl Iterator<Item = [f32; 3]> + '_ {
         self.points.iter().map(|point| point.map(|axis| f32::from(axis) * UNIT_M))
     }
 
     /// The voxels of the same sweep for a sensor in another orientation, `turned_from_sensor`; each point is kept with
     /// a probability.
-    pub fn turned_voxels(
+    pub(crate) fn turned_voxels(
         &self,
         turned_from_sensor: &Isometry3<f64>,
         keep: f64,
@@ -72,7 +72,7 @@ pub(super) fn heading_rad(world_from_sensor: &Isometry3<f64>) -> f64 {
 
 /// Paths of sweeps with true poses on disk. Each folder is one world: poses in different folders are unrelated.
 #[derive(Debug)]
-pub struct SweepList {
+pub(crate) struct SweepList {
     places: Vec<Place>,
     sha256: String,
     problems: Vec<String>,
@@ -94,7 +94,7 @@ impl SweepList {
     ///
     /// # Errors
     /// [`LocalizerTrainError`] when a folder cannot be read or holds no sweep.
-    pub fn open(folders: &[PathBuf]) -> Result<Self, LocalizerTrainError> {
+    pub(crate) fn open(folders: &[PathBuf]) -> Result<Self, LocalizerTrainError> {
         let (mut places, mut scenarios, mut problems) = (Vec::new(), Vec::new(), Vec::new());
         let mut drive = 0;
         for (world, folder) in folders.iter().enumerate() {
@@ -119,13 +119,13 @@ impl SweepList {
 
     /// Identity of the data, and the part of it that proved unusable so far.
     #[must_use]
-    pub fn data(&self) -> DataListing {
+    pub(crate) fn data(&self) -> DataListing {
         let without_pose = self.without_pose.lock().unwrap_or_else(PoisonError::into_inner).len();
         DataListing { sha256: self.sha256.clone(), without_pose, problems: self.problems.clone() }
     }
 
     /// Keeps at most `count` sweeps, evenly spread.
-    pub fn thin_out(&mut self, count: usize) {
+    pub(crate) fn thin_out(&mut self, count: usize) {
         let total = self.places.len();
         if total > count {
             let mut index = 0;
@@ -139,21 +139,15 @@ impl SweepList {
 
     /// Number of sweeps.
     #[must_use]
-    pub fn len(&self) -> usize {
+    pub(crate) fn len(&self) -> usize {
         self.places.len()
-    }
-
-    /// True if there is none.
-    #[must_use]
-    pub fn is_empty(&self) -> bool {
-        self.places.is_empty()
     }
 
     /// Reads one sweep, points within `range_m` of the sensor; `None` if its pose is unknown.
     ///
     /// # Errors
     /// [`LocalizerTrainError::Read`] names the file.
-    pub fn read(&self, index: usize, range_m: f64) -> Result<Option<StoredSweep>, LocalizerTrainError> {
+    pub(crate) fn read(&self, index: usize, range_m: f64) -> Result<Option<StoredSweep>, LocalizerTrainError> {
         let Place { scenario, agent, tick, world, drive } = &self.places[index];
         let mut frame = scenario.load(*agent, *tick, &LoadOptions::default())?;
         let Some(pose) = frame.world_from_lidar else {
@@ -168,7 +162,7 @@ impl SweepList {
 
 /// All sweeps of some folders in memory.
 #[derive(Debug)]
-pub struct SweepStore {
+pub(crate) struct SweepStore {
     /// The sweeps, drive after drive.
     pub sweeps: Vec<StoredSweep>,
     /// Identity of the data.
@@ -180,7 +174,7 @@ impl SweepStore {
     ///
     /// # Errors
     /// [`LocalizerTrainError`] when a folder cannot be read or holds no sweep with a pose.
-    pub fn read(folders: &[PathBuf], range_m: f64) -> Result<Self, LocalizerTrainError> {
+    pub(crate) fn read(folders: &[PathBuf], range_m: f64) -> Result<Self, LocalizerTrainError> {
         let list = Arc::new(SweepList::open(folders)?);
         let count = list.len();
         let source = Arc::clone(&list);

@@ -34,7 +34,7 @@ pub fn attend_ego(maps: &Tensor, valid: Option<&Tensor>) -> Result<Tensor, TchEr
 ///
 /// # Errors
 /// Those of the tensor library, when `record_len` does not add up to the number of maps.
-pub fn attend_samples(maps: &Tensor, record_len: &[i64]) -> Result<Tensor, TchError> {
+pub(crate) fn attend_samples(maps: &Tensor, record_len: &[i64]) -> Result<Tensor, TchError> {
     let samples = maps.f_split_with_sizes(record_len, 0)?;
     let fused: Result<Vec<_>, _> = samples.iter().map(|sample| attend_ego(sample, None)).collect();
     Tensor::f_stack(&fused?, 0)

@@ -4,9 +4,9 @@ use tch::nn::{self, BatchNormConfig, Init};
 use tch::{TchError, Tensor};
 
 /// Epsilon of every batch norm of PointPillars.
-pub const NORM_EPS: f64 = 1e-3;
+pub(crate) const NORM_EPS: f64 = 1e-3;
 /// Weight of a new batch in the running statistics of PointPillars.
-pub const NORM_MOMENTUM: f64 = 0.01;
+pub(crate) const NORM_MOMENTUM: f64 = 0.01;
 
 /// Batch norm over `channels` with the parameter names of the reference.
 ///
@@ -64,7 +64,7 @@ impl Norm {
     }
 
     /// The norm with its running statistics as `x * scale + shift`, both `[C]`.
-    pub fn scale_shift(&self) -> (Tensor, Tensor) {
+    pub(crate) fn scale_shift(&self) -> (Tensor, Tensor) {
         let scale = &self.weight / (&self.running_var + self.eps).sqrt();
         let shift = &self.bias - &self.running_mean * &scale;
         (scale, shift)
@@ -108,7 +108,7 @@ impl ConvLayer {
 
     /// `kernel x kernel` convolution without bias and with nothing after it.
     #[must_use]
-    pub fn unbiased(conv: &nn::Path<'_>, io: [i64; 2], kernel: i64, stride: i64) -> Self {
+    pub(crate) fn unbiased(conv: &nn::Path<'_>, io: [i64; 2], kernel: i64, stride: i64) -> Self {
         Self::down(conv, io, kernel, nn::ConvConfig { stride, padding: kernel / 2, bias: false, ..Default::default() })
     }
 
@@ -135,19 +135,19 @@ impl ConvLayer {
 
     /// The same with a batch norm after the convolution.
     #[must_use]
-    pub fn with_norm(self, norm: &nn::Path<'_>, channels: i64) -> Self {
+    pub(crate) fn with_norm(self, norm: &nn::Path<'_>, channels: i64) -> Self {
         Self { norm: Some(Norm::new(norm, channels)), ..self }
     }
 
     /// The same with a batch norm of another epsilon and momentum.
     #[must_use]
-    pub fn with_norm_of(self, norm: &nn::Path<'_>, channels: i64, (eps, momentum): (f64, f64)) -> Self {
+    pub(crate) fn with_norm_of(self, norm: &nn::Path<'_>, channels: i64, (eps, momentum): (f64, f64)) -> Self {
         Self { norm: Some(Norm::with_eps(norm, channels, eps, momentum)), ..self }
     }
 
     /// The same with a ReLU at the end.
     #[must_use]
-    pub fn with_relu(self) -> Self {
+    pub(crate) fn with_relu(self) -> Self {
         Self { relu: true, ..self }
     }
 
@@ -178,7 +178,7 @@ impl ConvLayer {
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub fn forward_contiguous(&self, x: &Tensor) -> Result<Tensor, TchError> {
+    pub(crate) fn forward_contiguous(&self, x: &Tensor) -> Result<Tensor, TchError> {
         let (batch, input, height, width) = x.size4()?;
         let kernel = self.weight.size();
         let pointwise = batch == 1 && kernel[2..] == [1, 1] && self.stride == 1 && self.direction == Direction::Down;

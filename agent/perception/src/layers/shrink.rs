@@ -38,7 +38,7 @@ impl Shrink {
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub fn forward_contiguous(&self, x: &Tensor) -> Result<Tensor, TchError> {
+    pub(crate) fn forward_contiguous(&self, x: &Tensor) -> Result<Tensor, TchError> {
         match self.layers.split_last() {
             Some((last, rest)) => last.forward_contiguous(&chain(rest, x, false)),
             None => x.f_contiguous(),

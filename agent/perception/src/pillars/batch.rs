@@ -6,7 +6,7 @@ use crate::model_config::DetectorConfig;
 use crate::pillars::voxels::Pillars;
 
 /// Inputs of the pillar encoder per point: x, y, z, intensity, offset from the pillar's mean, offset from its centre.
-pub const POINT_FEATURES: usize = 10;
+pub(crate) const POINT_FEATURES: usize = 10;
 
 /// Grid of the pillars: converts cell indices into metres.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -125,7 +125,7 @@ impl AdamW {
     ///
     /// # Errors
     /// The name of a moment that is missing or of another shape.
-    pub fn restore(&mut self, moments: &BTreeMap<String, Tensor>, steps: i64) -> Result<(), String> {
+    pub(crate) fn restore(&mut self, moments: &BTreeMap<String, Tensor>, steps: i64) -> Result<(), String> {
         for entry in &mut self.entries {
             for (prefix, moment) in [("mean", &mut entry.mean), ("square", &mut entry.square)] {
                 let name = format!("{prefix}.{}", entry.name);

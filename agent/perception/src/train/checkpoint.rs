@@ -95,7 +95,7 @@ pub fn save<P: Serialize>(
 /// # Errors
 /// [`CheckpointError`] when the file is missing, truncated or of another network; nothing has been changed in that
 /// case.
-pub fn restore<P: DeserializeOwned>(
+pub(crate) fn restore<P: DeserializeOwned>(
     path: &Path,
     variables: &VarStore,
     optimizer: &mut AdamW,

@@ -110,14 +110,7 @@ impl Cell {
 /// # Errors
 /// [`TableError::Io`] names the file that cannot be read.
 pub(super) fn pose_files(poses: &PoseSourceConfig) -> Result<Vec<String>, TableError> {
-    let files: Vec<&PathBuf> = match poses {
-        PoseSourceConfig::Recorded => vec![],
-        PoseSourceConfig::Noisy(noisy) => noisy.table.iter().collect(),
-        PoseSourceConfig::Pgc(pgc) => vec![&pgc.encoder, &pgc.head],
-        PoseSourceConfig::EndToEnd(network) => vec![&network.weights],
-        PoseSourceConfig::Cached(cached) => vec![&cached.file],
-    };
-    files.into_iter().map(|file| sha256(file)).collect()
+    poses.files().into_iter().map(sha256).collect()
 }
 
 /// SHA-256 of a file.

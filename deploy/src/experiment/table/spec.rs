@@ -133,7 +133,7 @@ impl TableSpec {
     ///
     /// # Errors
     /// [`TableError`] when neither the row nor the folder has any.
-    pub fn weights_of(&self, row: &Row) -> Result<Vec<PathBuf>, TableError> {
+    pub(crate) fn weights_of(&self, row: &Row) -> Result<Vec<PathBuf>, TableError> {
         match (&row.weights[..], &self.weights) {
             ([], Some(folder)) => Ok(vec![weights_of(folder, row.method)?]),
             ([], None) => Err(TableError::NoWeights(row.label())),

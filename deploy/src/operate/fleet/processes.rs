@@ -64,7 +64,7 @@ impl Fleet {
     ///
     /// # Errors
     /// [`RunFolderError::Write`] when the run folder cannot be written.
-    pub fn agent_processes(&self, context: &SessionContext<'_>) -> Result<Vec<ProcessSpec>, RunFolderError> {
+    pub(crate) fn agent_processes(&self, context: &SessionContext<'_>) -> Result<Vec<ProcessSpec>, RunFolderError> {
         let mut planner = self.planner(context);
         self.plan_agents(&mut planner)?;
         Ok(planner.specs)
@@ -93,7 +93,8 @@ impl Fleet {
     fn agent_config(&self, cav: &CavId, context: &SessionContext<'_>, bus: BusConfig) -> AgentConfig {
         let mut settings = self.scenario.settings_of(cav);
         let scene = self.scenario.scene.scenario.as_deref().unwrap_or_default();
-        settings.pose = settings.pose.for_scenario(scene);
+        let turn = self.agents.iter().position(|agent| agent == cav).and_then(|turn| u32::try_from(turn).ok());
+        settings.pose = settings.pose.for_scenario(scene).with_turn(turn.unwrap_or_default());
         let is_ego = *cav == self.ego;
         if is_ego {
             // It sends to its own ego, not over the link, and the ego needs its complete feature map.

@@ -48,10 +48,9 @@ impl Fleet {
     pub(super) fn recorded(&self, mut routes: Vec<Route>) -> Vec<Route> {
         if self.scenario.record.is_some() {
             let receiver = process_id(Role::Recorder, &recorder_cav());
-            let sensors = self
-                .agents
-                .iter()
-                .flat_map(|cav| [Stream::Lidar, Stream::Gnss].map(|stream| Topic::Stream { cav: cav.clone(), stream }));
+            let sensors = self.agents.iter().flat_map(|cav| {
+                [Stream::Lidar, Stream::Gnss, Stream::Imu].map(|stream| Topic::Stream { cav: cav.clone(), stream })
+            });
             let topics: BTreeSet<Topic> = routes.iter().map(|route| route.topic.clone()).chain(sensors).collect();
             routes.extend(topics.into_iter().map(|topic| Route { topic, receiver: receiver.clone() }));
         }

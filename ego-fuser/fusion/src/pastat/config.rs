@@ -18,7 +18,7 @@ pub enum Rows {
 /// Wavelengths of the temporal encoding as a function of the channel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Wavelengths {
+pub(crate) enum Wavelengths {
     /// `2k / D` for the sine (Eq. 11) and `(2k + 1) / D` for the cosine (Eq. 12), as the paper prints them.
     Printed,
     /// `2k / D` for both, as is usual.
@@ -28,7 +28,7 @@ pub enum Wavelengths {
 /// Feature Spatial Alignment.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct FsaConfig {
+pub(crate) struct FsaConfig {
     /// Channels in which maps are compared.
     pub matching: i64,
     /// Largest offset between compared cells, cells along x and along y.
@@ -47,7 +47,7 @@ pub struct FsaConfig {
 /// The search for a map with a large offset from its pose.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct SearchConfig {
+pub(crate) struct SearchConfig {
     /// Edge of the squares of cells that are pooled, cells.
     pub cells: i64,
     /// Largest offset of the search, pooled cells along x and along y.
@@ -73,7 +73,7 @@ impl Default for FsaConfig {
 /// Temporal feature memory: earlier maps, blended in cell by cell.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct MemoryConfig {
+pub(crate) struct MemoryConfig {
     /// Channels of the layer that predicts the weight of an earlier map.
     pub hidden: i64,
     /// Share of all tokens' patches that are blended, those where vehicles are most likely.
@@ -90,7 +90,7 @@ impl Default for MemoryConfig {
 /// the ablation.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct PastatConfig {
+pub(crate) struct PastatConfig {
     /// Channels of the maps.
     pub channels: i64,
     /// Cells along each edge of a token.
@@ -131,7 +131,7 @@ pub struct PastatConfig {
 impl PastatConfig {
     /// Sized for one core and live traffic.
     #[must_use]
-    pub fn lean(channels: i64) -> Self {
+    pub(crate) fn lean(channels: i64) -> Self {
         Self {
             channels,
             patch: 2,
@@ -154,7 +154,7 @@ impl PastatConfig {
 
     /// Sized like the transformer that the paper builds on.
     #[must_use]
-    pub fn full(channels: i64) -> Self {
+    pub(crate) fn full(channels: i64) -> Self {
         Self {
             patch: 1,
             dim: channels,
@@ -173,7 +173,7 @@ impl PastatConfig {
     /// Maps are padded to multiples of this many cells, so that tokens fill every window and cells fill every part of
     /// FSA.
     #[must_use]
-    pub fn padding_cells(&self) -> i64 {
+    pub(crate) fn padding_cells(&self) -> i64 {
         let larger = |fsa: &FsaConfig| {
             fsa.alignment_search.map_or(self.earlier_cells, |search| lcm(search.cells, self.earlier_cells))
         };
@@ -185,7 +185,7 @@ impl PastatConfig {
     ///
     /// # Errors
     /// [`ConfigError`] names the field, its value and what it must be.
-    pub fn validate(&self) -> Result<(), ConfigError> {
+    pub(crate) fn validate(&self) -> Result<(), ConfigError> {
         let error = |field, value: String, must| Err(ConfigError::Value { field, value, must });
         for (field, value, most) in [
             ("pastat channels", self.channels, 4096),

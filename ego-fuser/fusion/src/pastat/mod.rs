@@ -20,7 +20,8 @@ use perception::model_config::{ConfigError, DetectorConfig};
 use tch::{TchError, Tensor, nn};
 
 pub use ablation::{Part, ablated};
-pub use config::{FsaConfig, MemoryConfig, PastatConfig, Rows, SearchConfig, Wavelengths};
+pub(crate) use config::PastatConfig;
+pub use config::Rows;
 
 use self::coarse_alignment::CoarseAlignment;
 use self::confidence_embedding::ConfidenceEmbedding;
@@ -69,7 +70,7 @@ impl FusionSettings for PastatConfig {
 
 /// PASTAT between encoder and detection head.
 #[derive(Debug)]
-pub struct Pastat {
+pub(crate) struct Pastat {
     coarse_alignment: CoarseAlignment,
     patches: Patches,
     confidence_embedding: ConfidenceEmbedding,
@@ -86,7 +87,7 @@ impl Pastat {
     ///
     /// # Errors
     /// [`ConfigError`] when it cannot be built.
-    pub fn new(path: &nn::Path<'_>, config: &PastatConfig) -> Result<Self, ConfigError> {
+    pub(crate) fn new(path: &nn::Path<'_>, config: &PastatConfig) -> Result<Self, ConfigError> {
         config.validate()?;
         // Random parameters are drawn in this order.
         Ok(Self {

@@ -2,6 +2,7 @@ use protocol::{BevGrid, Pose};
 use tch::nn::VarStore;
 use tch::{Device, Kind};
 
+use super::config::{FsaConfig, Wavelengths};
 use super::spatial_alignment::FineMaps;
 use super::*;
 use crate::classes::Classes;

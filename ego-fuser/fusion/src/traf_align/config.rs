@@ -8,7 +8,7 @@ use crate::bounds::within;
 /// Sizes of [`TrafAlign`](super::TrafAlign).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct TrafAlignConfig {
+pub(crate) struct TrafAlignConfig {
     /// Channels of the maps.
     pub channels: i64,
     /// Cells along each edge of a token.
@@ -32,14 +32,14 @@ pub struct TrafAlignConfig {
 impl TrafAlignConfig {
     /// Sized for one core and live traffic.
     #[must_use]
-    pub fn lean(channels: i64) -> Self {
+    pub(crate) fn lean(channels: i64) -> Self {
         let (patch, dim, heads, kernel, layers, field) = (2, 32, 2, 3, 1, 3);
         Self { channels, patch, dim, heads, kernel, layers, field, frames: 3, frame_secs: 0.1 }
     }
 
     /// About the published sizes.
     #[must_use]
-    pub fn full(channels: i64) -> Self {
+    pub(crate) fn full(channels: i64) -> Self {
         Self { patch: 1, dim: channels, heads: 4, layers: 2, frames: 4, ..Self::lean(channels) }
     }
 
@@ -47,7 +47,7 @@ impl TrafAlignConfig {
     ///
     /// # Errors
     /// [`ConfigError`] names the field.
-    pub fn validate(&self) -> Result<(), ConfigError> {
+    pub(crate) fn validate(&self) -> Result<(), ConfigError> {
         within("fusion channels", self.channels, 1..=4096)?;
         within("fusion patch", self.patch, 1..=8)?;
         within("fusion dim", self.dim, 2..=4096)?;

@@ -26,7 +26,7 @@ use perception::model_config::{ConfigError, DetectorConfig};
 use tch::nn::{self, Init};
 use tch::{Kind, TchError, Tensor};
 
-pub use config::TrafAlignConfig;
+pub(crate) use config::TrafAlignConfig;
 
 use self::attention::TrajectoryAttention;
 use self::field::Trajectories;
@@ -37,7 +37,7 @@ use super::settings::{FusionSettings, HistorySpec, Requirements, of_size};
 use super::spec::{Exchange, FusionSpec, MethodSpec};
 
 /// TraF-Align.
-pub static METHOD: MethodSpec = MethodSpec {
+pub(crate) static METHOD: MethodSpec = MethodSpec {
     name: "traf_align",
     summary: "feature maps with history, attention along trajectories (TraF-Align)",
     exchange: Exchange::Features,
@@ -65,7 +65,7 @@ impl FusionSettings for TrafAlignConfig {
 
 /// Trajectory-aware fusion.
 #[derive(Debug)]
-pub struct TrafAlign {
+pub(crate) struct TrafAlign {
     config: TrafAlignConfig,
     tokeniser: ConvLayer,
     /// `[2 K, D]`: sine and cosine of an age to a token's channels.
@@ -84,7 +84,7 @@ impl TrafAlign {
     ///
     /// # Errors
     /// [`ConfigError`] names the field that no network can be built from.
-    pub fn new(path: &nn::Path<'_>, config: &TrafAlignConfig) -> Result<Self, ConfigError> {
+    pub(crate) fn new(path: &nn::Path<'_>, config: &TrafAlignConfig) -> Result<Self, ConfigError> {
         config.validate()?;
         let TrafAlignConfig { channels, patch, dim, .. } = *config;
         let layer = |index: usize| TrajectoryAttention::new(&(path / "layers" / index), config);

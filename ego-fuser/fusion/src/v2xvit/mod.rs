@@ -14,10 +14,11 @@ use perception::model_config::{ConfigError, DetectorConfig};
 use tch::nn;
 use tch::{TchError, Tensor};
 
-pub use agent_attention::{AGENT_TYPES, AgentAttention};
+pub use agent_attention::AgentAttention;
 pub use config::{Merge, V2xVitConfig, WindowConfig};
 pub use encoder::{Block, Encoder, Layer};
-pub use temporal_encoding::{ROW_SECS, TemporalEncoding};
+pub(crate) use temporal_encoding::ROW_SECS;
+pub use temporal_encoding::TemporalEncoding;
 pub use window_attention::{WindowAttention, WindowBranch};
 
 use super::block_order::BlockOrder;

@@ -8,7 +8,7 @@ use crate::layers::Linear;
 /// Rows of the table.
 const ROWS: i64 = 100;
 /// Time between two rows, seconds.
-pub const ROW_SECS: f64 = 0.05;
+pub(crate) const ROW_SECS: f64 = 0.05;
 
 /// Relative temporal encoding: a table over delays (`emb.emb`) and a linear layer behind it (`emb.lin`).
 #[derive(Debug)]

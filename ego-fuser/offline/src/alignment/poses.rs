@@ -64,6 +64,7 @@ impl AlignmentMethod for Poses {
             capture_nanos: frame.capture_nanos,
             cloud: &frame.points,
             measured: measured.as_ref(),
+            motion: frame.motion(),
         })))
     }
 

@@ -73,6 +73,7 @@ pub(super) fn view(
         capture_nanos: frame.capture_nanos,
         cloud: &frame.points,
         measured_pose: frame.world_from_lidar.as_ref(),
+        motion: frame.motion(),
     };
     let pose = participant.pose(&input);
     let stamp = stamp(participant.cav(), frame.capture_nanos);

@@ -23,7 +23,7 @@ impl Placement {
     ///
     /// # Errors
     /// [`TchError`] when there is no pose.
-    pub fn of_poses(ego_from_cav: &[Pose], grid: &BevGrid) -> Result<Self, TchError> {
+    pub(crate) fn of_poses(ego_from_cav: &[Pose], grid: &BevGrid) -> Result<Self, TchError> {
         let entries: Vec<f32> = ego_from_cav.iter().flat_map(|pose| cav_from_ego_normalized(pose, grid)).collect();
         let agents = ego_from_cav.len() as i64;
         Ok(Self { agents, theta: Some(Tensor::f_from_slice(&entries)?.f_view([agents, 2, 3])?) })

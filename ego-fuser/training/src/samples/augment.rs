@@ -22,7 +22,7 @@ pub struct Augmentation {
 
 impl Augmentation {
     /// No changes.
-    pub const OFF: Self = Self { mirror: 0.0, turn_rad: 0.0, scale: 0.0 };
+    pub(crate) const OFF: Self = Self { mirror: 0.0, turn_rad: 0.0, scale: 0.0 };
 
     /// Draws the common changes of a scene.
     pub fn scene(&self, rng: &mut impl Rng) -> SceneAugment {

@@ -205,7 +205,7 @@ impl SampleBuilder {
             let place = newest.len();
             for (step, tick) in self.config.moments.steps(ticks, now.tick, last, gap).into_iter().enumerate() {
                 let [found, pose] = self.pose_at(TickRef { tick, ..now }, agent, [index, agents.len()], &error)?;
-                let PoseEstimate::Pose { world_from_cav, confidence } = pose else {
+                let PoseEstimate::Pose { world_from_cav, confidence, .. } = pose else {
                     match step {
                         0 => break,
                         _ => continue,

@@ -42,7 +42,7 @@ impl Batch {
     ///
     /// # Errors
     /// [`SampleError::Torch`] when maps are of different shapes.
-    pub fn collate(samples: Vec<Sample>, pillar_grid: &PillarGrid) -> Result<Self, SampleError> {
+    pub(crate) fn collate(samples: Vec<Sample>, pillar_grid: &PillarGrid) -> Result<Self, SampleError> {
         let (mut pillars, mut maps) = (Vec::new(), Vec::new());
         for sample in &samples {
             match &sample.views {

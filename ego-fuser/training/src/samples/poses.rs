@@ -41,7 +41,7 @@ impl SamplePoses {
 
     /// The same without an added error.
     #[must_use]
-    pub fn without_noise(&self) -> Self {
+    pub(crate) fn without_noise(&self) -> Self {
         Self { noise: None, lost_share: 0.0, ..self.clone() }
     }
 
@@ -130,7 +130,7 @@ impl DrawnError {
         let noisy = self.noisy(found, cav, capture_nanos, agent == 0);
         let is_lost = |lost: &&Lost| agent > 0 && lost.draw % (agents - 1) == agent - 1;
         match (self.lost.as_ref().filter(is_lost), noisy) {
-            (Some(lost), PoseEstimate::Pose { world_from_cav, confidence }) => {
+            (Some(lost), PoseEstimate::Pose { world_from_cav, confidence, .. }) => {
                 let [x, y, z] = world_from_cav.translation_m;
                 let shifted = [x + lost.shift_m[0], y + lost.shift_m[1], z];
                 PoseEstimate::new(Pose::from_xyz_yaw(shifted, world_from_cav.yaw_rad() + lost.turn_rad), confidence)
@@ -140,14 +140,14 @@ impl DrawnError {
     }
 
     fn noisy(&self, found: PoseEstimate, cav: &CavId, capture_nanos: u64, is_ego: bool) -> PoseEstimate {
-        let (Some(noise), PoseEstimate::Pose { world_from_cav, confidence }) = (&self.noise, found) else {
+        let (Some(noise), PoseEstimate::Pose { world_from_cav, confidence, .. }) = (&self.noise, found) else {
             return found;
         };
         if is_ego && self.spares_ego {
             return found;
         }
         match noise.disturbed(cav, capture_nanos, &world_from_cav) {
-            PoseEstimate::Pose { world_from_cav, confidence: of_error } => {
+            PoseEstimate::Pose { world_from_cav, confidence: of_error, .. } => {
                 PoseEstimate::new(world_from_cav, confidence * of_error)
             }
             none @ PoseEstimate::NoPose { .. } => none,
@@ -176,7 +176,7 @@ mod tests {
         let off = |seed| drawn(NoiseMode::Independent, 1.0, seed).added(found, &cav, 5, [0, 2]);
         assert_eq!(off(1), off(1));
         assert_ne!(off(1), off(2));
-        let PoseEstimate::Pose { world_from_cav, confidence } = off(1) else { panic!() };
+        let PoseEstimate::Pose { world_from_cav, confidence, .. } = off(1) else { panic!() };
         let [x, y, z] = world_from_cav.translation_m;
         let square = x * x + y * y + z * z;
         assert!((f64::from(confidence) - 0.8 / (1.0 + square)).abs() < 1e-5);
@@ -201,7 +201,7 @@ mod tests {
             let reported: Vec<_> = (0..4).map(|agent| error.added(found, &cav, 5, [agent, 4])).collect();
             let lost: Vec<_> = (0..4).filter(|&agent| reported[agent] != found).collect();
             assert!(lost.len() == 1 && lost[0] > 0, "{lost:?}");
-            let PoseEstimate::Pose { world_from_cav, confidence } = reported[lost[0]] else { panic!() };
+            let PoseEstimate::Pose { world_from_cav, confidence, .. } = reported[lost[0]] else { panic!() };
             let [x, y, _] = world_from_cav.translation_m;
             assert!(LOST_M.contains(&x.hypot(y)) && (confidence - 0.8).abs() < 1e-6);
             assert_eq!(error.added(found, &cav, 99, [lost[0], 4]), reported[lost[0]]);

@@ -21,7 +21,7 @@ pub use accuracy::Accuracy;
 pub use config::TrainConfig;
 pub use error::TrainError;
 pub use observer::{Observer, StepReport, Summary};
-pub use validation::Validator;
+pub(crate) use validation::Validator;
 
 use self::curve::DetectorCurve;
 use crate::loss::{LabelTensors, alignment_loss, detection_loss};

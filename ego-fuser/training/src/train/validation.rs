@@ -18,7 +18,7 @@ use fusion::model::CooperativeModel;
 /// Measures AP on a fixed choice of frames, each from a fixed vehicle, with no agent missing or late and no added pose
 /// error.
 #[derive(Debug)]
-pub struct Validator {
+pub(crate) struct Validator {
     builder: SampleBuilder,
     ticks: Vec<TickRef>,
 }
@@ -28,7 +28,7 @@ impl Validator {
     ///
     /// # Errors
     /// [`TrainError::Sample`] when a folder cannot be read.
-    pub fn open(
+    pub(crate) fn open(
         scenes: SceneSet,
         samples: &SampleConfig,
         model: &CooperativeModel,
@@ -65,7 +65,7 @@ impl Validator {
     ///
     /// # Errors
     /// [`TrainError`] when a frame cannot be read or does not fit the model.
-    pub fn measure(&mut self, model: &CooperativeModel) -> Result<Accuracy, TrainError> {
+    pub(crate) fn measure(&mut self, model: &CooperativeModel) -> Result<Accuracy, TrainError> {
         let mut scorer = Scorer::default();
         let limits = model.limits();
         for (number, &tick) in self.ticks.iter().enumerate() {

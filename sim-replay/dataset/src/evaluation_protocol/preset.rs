@@ -25,7 +25,7 @@ pub const PRESETS: [(&str, &str); 14] = [
 
 /// The default preset of a layout.
 #[must_use]
-pub fn preset_of_layout(layout: Layout) -> &'static str {
+pub(crate) fn preset_of_layout(layout: Layout) -> &'static str {
     match layout {
         Layout::V2v4Real => "v2v4real",
         Layout::V2xReal => "v2xreal",

@@ -120,7 +120,7 @@ pub fn decode(bytes: &[u8]) -> Result<PcdCloud, PcdError> {
 ///
 /// # Errors
 /// As [`decode`].
-pub fn decode_stored(bytes: &[u8]) -> Result<PcdCloud, PcdError> {
+pub(crate) fn decode_stored(bytes: &[u8]) -> Result<PcdCloud, PcdError> {
     let (header, body) = Header::parse(bytes)?;
     let cloud = match header.data {
         Data::Ascii => ascii::decode(&header, body),

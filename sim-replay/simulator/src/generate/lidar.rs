@@ -32,7 +32,7 @@ const GROUND_REFLECTIVITY: f32 = 0.25;
 
 /// The rays of one turn. The sensor turns clockwise seen from above and passes the rear when a sweep begins and ends.
 #[must_use]
-pub fn lidar_pattern() -> RayPattern {
+pub(crate) fn lidar_pattern() -> RayPattern {
     let [low, high] = ELEVATIONS_DEG.map(f32::to_radians);
     let azimuth_step_rad = -TAU / COLUMNS as f32;
     RayPattern {
@@ -153,7 +153,7 @@ fn measure(
 
 /// The point of a pose at which a sweep is given, relative to the vehicle's own origin.
 #[must_use]
-pub fn lidar_motion(vehicle: &Sweep) -> Sweep {
+pub(crate) fn lidar_motion(vehicle: &Sweep) -> Sweep {
     vehicle.mounted(LIDAR_MOUNT_M)
 }
 

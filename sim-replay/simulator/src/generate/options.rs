@@ -109,7 +109,7 @@ impl SynthOptions {
 
     /// Steps of the simulation from one stored frame to the next.
     #[must_use]
-    pub fn steps_per_frame(&self) -> usize {
+    pub(crate) fn steps_per_frame(&self) -> usize {
         (self.period_s / STEP_S).round() as usize
     }
 

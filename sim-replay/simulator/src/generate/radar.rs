@@ -9,7 +9,7 @@ use support::random::SplitMix64;
 ///
 /// Red 0 is -64 m/s (approaching), 255 is +64 m/s, `v = (red / 255 - 0.5) * 128`; steps of half a metre per second.
 /// V2X-R stores its velocities in the red channel too and leaves the mapping open.
-pub const RADAR_VELOCITY_SPAN_MPS: f64 = 64.0;
+pub(crate) const RADAR_VELOCITY_SPAN_MPS: f64 = 64.0;
 
 /// Height of the radar above the ground, metres; it sits at the front bumper.
 const HEIGHT_M: f64 = 0.7;
@@ -102,7 +102,7 @@ fn velocity_mps(motion: &Sweep, sweep_s: f64) -> Vector3<f64> {
 
 /// A radial velocity as the red channel holds it, 0..1; see [`RADAR_VELOCITY_SPAN_MPS`].
 #[must_use]
-pub fn velocity_to_red(velocity_mps: f32) -> f32 {
+pub(crate) fn velocity_to_red(velocity_mps: f32) -> f32 {
     (velocity_mps / (2.0 * RADAR_VELOCITY_SPAN_MPS as f32) + 0.5).clamp(0.0, 1.0)
 }
 

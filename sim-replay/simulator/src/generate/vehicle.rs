@@ -109,13 +109,13 @@ impl Vehicle {
 
     /// A random vehicle with the frequencies of parked vehicles.
     #[must_use]
-    pub fn random_parked(random: &mut SplitMix64) -> Self {
+    pub(crate) fn random_parked(random: &mut SplitMix64) -> Self {
         Self::random(random, |stock| stock.parked)
     }
 
     /// A vehicle that may carry the sensors: one low enough for a LiDAR on its roof.
     #[must_use]
-    pub fn random_connected(random: &mut SplitMix64) -> Self {
+    pub(crate) fn random_connected(random: &mut SplitMix64) -> Self {
         let low = |kind| matches!(kind, VehicleKind::Sedan | VehicleKind::Hatchback | VehicleKind::Suv);
         Self::random(random, |stock| if low(stock.kind) { stock.driving } else { 0.0 })
     }

@@ -4,7 +4,7 @@ use super::convex::{CellIndex, Rectangle, bounds, overlap};
 use super::{LaneId, MapModel, Shape, Solid};
 
 /// Height over a lane that stays free of solids, metres.
-pub const LANE_HEADROOM_M: f64 = 4.5;
+pub(crate) const LANE_HEADROOM_M: f64 = 4.5;
 /// Solids whose top is this little above a lane lie under it (slabs of bridges), metres.
 const SURFACE_M: f64 = 0.02;
 /// Edge of a cell of the index, metres.

@@ -1,7 +1,7 @@
 //! The ground: terrain under everything, and road surfaces that pass above it.
 
 /// A triangle in the world frame, metres; anticlockwise seen from above.
-pub type Triangle = [[f64; 3]; 3];
+pub(crate) type Triangle = [[f64; 3]; 3];
 
 /// Terrain and decks.
 #[derive(Debug, Clone, PartialEq)]
@@ -58,7 +58,7 @@ impl Ground {
 
     /// The height of the terrain where it is level everywhere.
     #[must_use]
-    pub fn plane_z_m(&self) -> Option<f64> {
+    pub(crate) fn plane_z_m(&self) -> Option<f64> {
         match self.terrain {
             Terrain::Plane { z_m } => Some(z_m),
             Terrain::Grid(_) => None,
@@ -69,7 +69,7 @@ impl Ground {
 impl HeightGrid {
     /// Height of the node in `column` and `row`, clamped to the grid, metres.
     #[must_use]
-    pub fn node_m(&self, column: usize, row: usize) -> f64 {
+    pub(crate) fn node_m(&self, column: usize, row: usize) -> f64 {
         f64::from(self.heights_m[row.min(self.rows - 1) * self.columns + column.min(self.columns - 1)])
     }
 

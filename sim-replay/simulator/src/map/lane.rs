@@ -109,7 +109,7 @@ impl Lane {
 
     /// Slope across the lane at `s_m`, radians; see [`Lane::banks_rad`].
     #[must_use]
-    pub fn bank_rad(&self, s_m: f64) -> f64 {
+    pub(crate) fn bank_rad(&self, s_m: f64) -> f64 {
         let Some(last) = self.banks_rad.len().checked_sub(1).filter(|&last| last > 0) else { return 0.0 };
         let step = (s_m / self.length_m * last as f64).clamp(0.0, last as f64);
         let index = (step as usize).min(last - 1);

@@ -7,7 +7,7 @@ const CELL_M: f64 = 8.0;
 
 /// A position on a lane.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct LanePosition {
+pub(crate) struct LanePosition {
     /// The lane.
     pub lane: LaneId,
     /// Distance from the lane's start along its centre line, metres.
@@ -18,7 +18,7 @@ pub struct LanePosition {
 
 /// A grid over the points of all centre lines, for the nearest lane in constant time.
 #[derive(Debug, Clone)]
-pub struct LaneIndex {
+pub(crate) struct LaneIndex {
     origin_m: [f64; 2],
     columns: usize,
     rows: usize,
@@ -31,7 +31,7 @@ pub struct LaneIndex {
 impl LaneIndex {
     /// Indexes every centre line of `graph`.
     #[must_use]
-    pub fn new(graph: &LaneGraph) -> Self {
+    pub(crate) fn new(graph: &LaneGraph) -> Self {
         let points = || graph.lanes.iter().flat_map(|lane| lane.centerline.iter());
         let low = points().fold([f64::INFINITY; 2], |low, p| [low[0].min(p[0]), low[1].min(p[1])]);
         let high = points().fold([f64::NEG_INFINITY; 2], |high, p| [high[0].max(p[0]), high[1].max(p[1])]);
@@ -60,7 +60,7 @@ impl LaneIndex {
     /// The lane nearest to `x`, `y` within `radius_m`; with `heading_rad`, only lanes that lead the same way within
     /// 60 degrees; with `z_m`, only where the lane is within 3 m of that height (roads pass above each other).
     #[must_use]
-    pub fn nearest(
+    pub(crate) fn nearest(
         &self,
         graph: &LaneGraph,
         [x, y]: [f64; 2],

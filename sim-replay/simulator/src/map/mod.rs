@@ -16,7 +16,7 @@ mod finding;
 mod ground;
 mod lane;
 pub mod lane_builder;
-pub mod lane_links;
+pub(crate) mod lane_links;
 mod lane_queries;
 pub mod lateral;
 mod layout;
@@ -29,17 +29,16 @@ mod solid;
 mod surface;
 mod terrain;
 
-use std::path::{Path, PathBuf};
-
-pub use clearance::LANE_HEADROOM_M;
 pub use finding::Finding;
-pub use ground::{Ground, HeightGrid, Terrain, Triangle};
+pub(crate) use ground::Triangle;
+pub use ground::{Ground, HeightGrid, Terrain};
 pub use lane::{JunctionId, Lane, LaneGraph, LaneId, Turn};
-pub use lane_queries::{LaneIndex, LanePosition};
+pub(crate) use lane_queries::LaneIndex;
 use layout::Layout;
 pub use opendrive::OpenDriveError;
 use road::RoadNetwork;
 pub use solid::{Shape, Solid, SolidKind};
+use std::path::{Path, PathBuf};
 use surface::Surface;
 
 use support::bounded_file;

@@ -18,7 +18,12 @@ impl Profile {
 
     /// The cubic that leads from one value and slope to another over `length` from `start` on.
     #[must_use]
-    pub fn hermite(start: f64, length: f64, [from, slope]: [f64; 2], [to, end_slope]: [f64; 2]) -> (f64, [f64; 4]) {
+    pub(crate) fn hermite(
+        start: f64,
+        length: f64,
+        [from, slope]: [f64; 2],
+        [to, end_slope]: [f64; 2],
+    ) -> (f64, [f64; 4]) {
         let rise = (to - from) / length;
         let c = (3.0 * rise - 2.0 * slope - end_slope) / length;
         let d = (slope + end_slope - 2.0 * rise) / (length * length);
@@ -33,7 +38,7 @@ impl Profile {
 
     /// Slope at `s`.
     #[must_use]
-    pub fn slope_at(&self, s: f64) -> f64 {
+    pub(crate) fn slope_at(&self, s: f64) -> f64 {
         self.record_at(s).map_or(0.0, |(start, coefficients)| cubic_slope(coefficients, s - start))
     }
 

@@ -218,12 +218,12 @@ impl LaneSection {
 
     /// True if lanes are kept level where the road is not.
     #[must_use]
-    pub fn has_level_lanes(&self) -> bool {
+    pub(crate) fn has_level_lanes(&self) -> bool {
         self.left.iter().chain(&self.right).any(|lane| lane.level)
     }
 
     /// Ids of all lanes, from the rightmost to the leftmost.
-    pub fn lane_ids(&self) -> impl Iterator<Item = i32> + use<> {
+    pub(crate) fn lane_ids(&self) -> impl Iterator<Item = i32> + use<> {
         let (right, left) = (self.right.len() as i32, self.left.len() as i32);
         (-right..=left).filter(|&id| id != 0)
     }
@@ -241,7 +241,7 @@ impl Road {
 
     /// Place at `s_m`, `t_m` of section `section`, on the road's surface, metres.
     #[must_use]
-    pub fn point_at(&self, section: usize, s_m: f64, t_m: f64) -> [f64; 3] {
+    pub(crate) fn point_at(&self, section: usize, s_m: f64, t_m: f64) -> [f64; 3] {
         let z_m = self.elevation.at(s_m);
         if self.lateral.is_level() {
             let pose = self.pose_at(s_m).moved(0.0, t_m, 0.0);
@@ -255,7 +255,7 @@ impl Road {
     /// Distance beside the reference line (positive to the left) and height over it of the surface at `s_m`, `t_m` of
     /// section `section`, metres. On a level road that is `t_m` and 0.
     #[must_use]
-    pub fn aside_m(&self, section: usize, s_m: f64, t_m: f64) -> [f64; 2] {
+    pub(crate) fn aside_m(&self, section: usize, s_m: f64, t_m: f64) -> [f64; 2] {
         if self.lateral.is_level() {
             return [t_m, 0.0];
         }
@@ -280,7 +280,7 @@ impl Road {
     /// Slope across lane `id` of section `section` at `s_m` as an angle, radians; positive where the left side of the
     /// road (not of the lane's traffic) is higher.
     #[must_use]
-    pub fn bank_rad(&self, section: usize, id: i32, s_m: f64) -> f64 {
+    pub(crate) fn bank_rad(&self, section: usize, id: i32, s_m: f64) -> f64 {
         if self.lateral.is_level() {
             return 0.0;
         }
@@ -293,7 +293,7 @@ impl Road {
 
     /// True if traffic on lane `id` of section `section` leads along the road.
     #[must_use]
-    pub fn leads_along(&self, section: usize, id: i32) -> bool {
+    pub(crate) fn leads_along(&self, section: usize, id: i32) -> bool {
         let reversed =
             self.sections.get(section).and_then(|section| section.lane(id)).is_some_and(|lane| lane.reversed);
         ((id < 0) != self.left_hand) != reversed
@@ -301,26 +301,26 @@ impl Road {
 
     /// End of section `index`, metres.
     #[must_use]
-    pub fn section_end_m(&self, index: usize) -> f64 {
+    pub(crate) fn section_end_m(&self, index: usize) -> f64 {
         self.sections.get(index + 1).map_or(self.length_m, |next| next.s_m.min(self.length_m))
     }
 
     /// Index of the section at `s_m` in [`Road::sections`].
     #[must_use]
-    pub fn section_at(&self, s_m: f64) -> usize {
+    pub(crate) fn section_at(&self, s_m: f64) -> usize {
         self.sections.partition_point(|section| section.s_m <= s_m).saturating_sub(1)
     }
 
     /// Shift of the lanes' origin across the road at `s_m`, metres, clamped to the limits of a road since cubics of a
     /// map are unbounded.
     #[must_use]
-    pub fn lane_offset_m(&self, s_m: f64) -> f64 {
+    pub(crate) fn lane_offset_m(&self, s_m: f64) -> f64 {
         self.lane_offset.at(s_m).clamp(-MAX_OFFSET_M, MAX_OFFSET_M)
     }
 
     /// Lower and upper `t` of lane `id` of section `section` at `s_m`, metres.
     #[must_use]
-    pub fn lane_span_m(&self, section: usize, id: i32, s_m: f64) -> [f64; 2] {
+    pub(crate) fn lane_span_m(&self, section: usize, id: i32, s_m: f64) -> [f64; 2] {
         let section = &self.sections[section];
         let side = if id > 0 { &section.left } else { &section.right };
         let width = |lane: &RoadLane| lane.width.at(s_m - section.s_m).clamp(0.0, MAX_WIDTH_M);
@@ -333,7 +333,7 @@ impl Road {
 
     /// Speed limit at `s_m` where the road has one, metres per second.
     #[must_use]
-    pub fn speed_limit_mps(&self, s_m: f64) -> Option<f64> {
+    pub(crate) fn speed_limit_mps(&self, s_m: f64) -> Option<f64> {
         let after = self.speed_limits.partition_point(|&(start, _)| start <= s_m);
         self.speed_limits.get(after.saturating_sub(1)).map(|&(_, limit)| limit)
     }

@@ -59,7 +59,7 @@ pub enum Shape {
 impl Shape {
     /// Half of the height, metres.
     #[must_use]
-    pub fn half_height_m(&self) -> f64 {
+    pub(crate) fn half_height_m(&self) -> f64 {
         match *self {
             Self::Box { half_m: [_, _, half] } | Self::Cylinder { half_height_m: half, .. } => half,
             Self::Ellipsoid { radii_m: [_, _, radius] } => radius,
@@ -68,7 +68,7 @@ impl Shape {
 
     /// Half lengths along the shape's own x and y of the rectangle around its outline seen from above, metres.
     #[must_use]
-    pub fn half_footprint_m(&self) -> [f64; 2] {
+    pub(crate) fn half_footprint_m(&self) -> [f64; 2] {
         match *self {
             Self::Box { half_m: [x, y, _] } | Self::Ellipsoid { radii_m: [x, y, _] } => [x, y],
             Self::Cylinder { radius_m, .. } => [radius_m, radius_m],
@@ -100,19 +100,19 @@ impl Solid {
 
     /// Height of its lowest point, metres in the world frame.
     #[must_use]
-    pub fn bottom_m(&self) -> f64 {
+    pub(crate) fn bottom_m(&self) -> f64 {
         self.center_m[2] - self.shape.half_height_m()
     }
 
     /// Height of its highest point, metres in the world frame.
     #[must_use]
-    pub fn top_m(&self) -> f64 {
+    pub(crate) fn top_m(&self) -> f64 {
         self.center_m[2] + self.shape.half_height_m()
     }
 
     /// Axis-aligned bounds in the world frame: lowest and highest corner, metres.
-    #[must_use]
-    pub fn bounds_m(&self) -> ([f64; 3], [f64; 3]) {
+    #[cfg(test)]
+    pub(crate) fn bounds_m(&self) -> ([f64; 3], [f64; 3]) {
         let [half_x, half_y] = self.shape.half_footprint_m();
         let (sin, cos) = self.yaw_rad.sin_cos();
         let half = match self.shape {

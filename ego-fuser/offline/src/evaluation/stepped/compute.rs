@@ -89,6 +89,7 @@ impl Evaluator {
                     capture_nanos: frame.capture_nanos,
                     cloud: &frame.points,
                     measured_pose: frame.world_from_lidar.as_ref(),
+                    motion: frame.motion(),
                 };
                 let began = Instant::now();
                 participant.pose(&input);

@@ -57,6 +57,7 @@ pub enum RemoteError {
 /// Publishers of a vehicle's sweeps.
 struct Sensors {
     gnss: Publisher,
+    imu: Publisher,
     lidar: Publisher,
 }
 
@@ -102,10 +103,17 @@ impl RemotePool {
         for (cav, stream) in vehicles {
             let topic = |stream| Topic::Stream { cav: cav.clone(), stream };
             let publisher = |stream| bus.publisher(topic(stream), PublisherOptions::SENSOR.lossless(1));
-            sensors.insert(cav.clone(), Sensors { gnss: publisher(Stream::Gnss)?, lidar: publisher(Stream::Lidar)? });
+            sensors.insert(
+                cav.clone(),
+                Sensors {
+                    gnss: publisher(Stream::Gnss)?,
+                    imu: publisher(Stream::Imu)?,
+                    lidar: publisher(Stream::Lidar)?,
+                },
+            );
             let there = process_id(Role::Agent, cav);
             let route = |stream, receiver: &ProcessId| Route { topic: topic(stream), receiver: receiver.clone() };
-            routes.extend([route(Stream::Gnss, &there), route(Stream::Lidar, &there)]);
+            routes.extend([Stream::Gnss, Stream::Imu, Stream::Lidar].map(|stream| route(stream, &there)));
             for stream in [Stream::Pose, *stream] {
                 subscriptions.push(bus.subscribe(topic(stream), &inbox)?);
                 routes.push(route(stream, &here));
@@ -117,17 +125,23 @@ impl RemotePool {
 
     /// Ends the streams of sweeps.
     pub(in super::super) fn finish(self) {
-        self.sensors.into_values().flat_map(|sensors| [sensors.gnss, sensors.lidar]).for_each(Publisher::finish);
+        self.sensors
+            .into_values()
+            .flat_map(|Sensors { gnss, imu, lidar }| [gnss, imu, lidar])
+            .for_each(Publisher::finish);
     }
 
     /// Sends the sweeps of a tick and waits for all answers, in the same order.
     pub(super) fn request(&self, frames: &[&Frame]) -> Result<Vec<Sent>, RemoteError> {
         for frame in frames {
-            let Some(Sensors { gnss, lidar }) = self.sensors.get(&frame.cav) else { continue };
+            let Some(Sensors { gnss, imu, lidar }) = self.sensors.get(&frame.cav) else { continue };
             if let Some(world_from_lidar) = frame.world_from_lidar {
                 let source = GnssSource::Recorded;
                 let measured = Gnss { world_from_lidar, position_std_m: 0.0, heading_std_rad: 0.0, source };
                 gnss.submit(frame.capture_nanos, measured);
+            }
+            if !frame.motion().is_empty() {
+                imu.submit(frame.capture_nanos, frame.motion());
             }
             lidar.submit(frame.capture_nanos, Lidar { points: frame.points.clone() });
         }

@@ -10,7 +10,7 @@ use super::placement::{Placement, Sweep};
 ///
 /// The rays of one column share one origin and lie in one plane, so most of an intersection is done once a column.
 #[derive(Debug, Clone, PartialEq)]
-pub struct RayPattern {
+pub(crate) struct RayPattern {
     /// Azimuth of the first column, radians.
     pub first_azimuth_rad: f32,
     /// Step from one column to the next, radians; negative turns clockwise seen from above.
@@ -32,25 +32,25 @@ pub struct RayPattern {
 impl RayPattern {
     /// True if the columns go all the way round.
     #[must_use]
-    pub fn is_full_turn(&self) -> bool {
+    pub(crate) fn is_full_turn(&self) -> bool {
         self.azimuth_step_rad.abs() * self.columns as f32 > TAU - 0.5 * self.azimuth_step_rad.abs()
     }
 
     /// Azimuth of a column, radians.
     #[must_use]
-    pub fn azimuth_rad(&self, column: usize) -> f32 {
+    pub(crate) fn azimuth_rad(&self, column: usize) -> f32 {
         self.first_azimuth_rad + self.azimuth_step_rad * column as f32
     }
 
     /// Elevation of a channel, radians.
     #[must_use]
-    pub fn elevation_rad(&self, channel: usize) -> f32 {
+    pub(crate) fn elevation_rad(&self, channel: usize) -> f32 {
         self.first_elevation_rad + self.elevation_step_rad * channel as f32
     }
 
     /// Time at which a column is measured: 0 at the start of the sweep, 1 at its end.
     #[must_use]
-    pub fn time(&self, column: usize) -> f64 {
+    pub(crate) fn time(&self, column: usize) -> f64 {
         if self.rolling { (column + 1) as f64 / self.columns as f64 } else { 1.0 }
     }
 }

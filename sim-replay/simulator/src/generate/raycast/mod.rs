@@ -13,7 +13,7 @@ mod placement;
 #[cfg(test)]
 mod tests;
 
-pub use column::RayPattern;
+pub(crate) use column::RayPattern;
 pub use part::{Bounds, Part};
 pub use placement::{Placement, Sweep, wrapped};
 
@@ -23,9 +23,9 @@ use column::{ColumnPose, ColumnRays};
 use footprint::{Footprint, SensorFrames};
 
 /// [`RangeImage::hits`] of a ray without a hit.
-pub const MISS: u32 = u32::MAX;
+pub(crate) const MISS: u32 = u32::MAX;
 /// [`RangeImage::hits`] of a ray that hit the ground.
-pub const GROUND: u32 = u32::MAX - 1;
+pub(crate) const GROUND: u32 = u32::MAX - 1;
 
 /// Geometry of a body: convex parts in its own frame.
 #[derive(Debug, Clone, PartialEq)]
@@ -100,7 +100,7 @@ impl Surface for Plane {
 
 /// Pose of one column when it was measured, relative to the sensor at the sweep's end.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct SkewedColumn {
+pub(crate) struct SkewedColumn {
     /// Origin of the column, metres.
     pub origin_m: Vector3<f32>,
     /// Direction of the column at elevation 0.
@@ -113,14 +113,14 @@ impl SkewedColumn {
     /// The point at `range_m` along the ray of an elevation given by its cosine and sine.
     #[inline]
     #[must_use]
-    pub fn point_m(&self, (cos, sin): (f32, f32), range_m: f32) -> [f32; 3] {
+    pub(crate) fn point_m(&self, (cos, sin): (f32, f32), range_m: f32) -> [f32; 3] {
         (self.origin_m + (self.forward * cos + self.up * sin) * range_m).into()
     }
 }
 
 /// Hits of one sweep: `[columns, channels]`, the channels of a column side by side.
 #[derive(Debug, Clone, PartialEq, Default)]
-pub struct RangeImage {
+pub(crate) struct RangeImage {
     /// Distance of the first hit, metres; the pattern's range where there is none.
     pub depths_m: Vec<f32>,
     /// Index into the bodies that were cast, [`GROUND`] or [`MISS`].
@@ -129,7 +129,7 @@ pub struct RangeImage {
 
 /// Casts sweeps of one pattern; keeps its buffers from one to the next.
 #[derive(Debug, Clone)]
-pub struct Caster {
+pub(crate) struct Caster {
     pattern: RayPattern,
     cos: Vec<f32>,
     sin: Vec<f32>,
@@ -141,7 +141,7 @@ pub struct Caster {
 impl Caster {
     /// A caster for sweeps of `pattern`.
     #[must_use]
-    pub fn new(pattern: RayPattern) -> Self {
+    pub(crate) fn new(pattern: RayPattern) -> Self {
         let elevations: Vec<f32> = (0..pattern.channels).map(|channel| pattern.elevation_rad(channel)).collect();
         Self {
             cos: elevations.iter().map(|elevation| elevation.cos()).collect(),
@@ -155,12 +155,12 @@ impl Caster {
 
     /// The pattern.
     #[must_use]
-    pub fn pattern(&self) -> &RayPattern {
+    pub(crate) fn pattern(&self) -> &RayPattern {
         &self.pattern
     }
 
     /// Casts one sweep: `sensor` is `world_from_sensor` over it. Bodies around the sensor itself are transparent.
-    pub fn cast(&mut self, sensor: &Sweep, ground: &dyn Surface, bodies: &[Body<'_>]) -> &RangeImage {
+    pub(crate) fn cast(&mut self, sensor: &Sweep, ground: &dyn Surface, bodies: &[Body<'_>]) -> &RangeImage {
         let anchor = sensor.end.position_m;
         let (pattern, channels) = (&self.pattern, self.pattern.channels);
         self.columns.clear();
@@ -193,12 +193,12 @@ impl Caster {
 
     /// The last sweep, as [`Caster::cast`] returned it.
     #[must_use]
-    pub fn image(&self) -> &RangeImage {
+    pub(crate) fn image(&self) -> &RangeImage {
         &self.image
     }
 
     /// The columns of the last sweep in the frame of the sensor at the sweep's end, where de-skewed points lie.
-    pub fn columns_at_end<'a>(&'a self, sensor: &Sweep) -> impl Iterator<Item = SkewedColumn> + 'a {
+    pub(crate) fn columns_at_end<'a>(&'a self, sensor: &Sweep) -> impl Iterator<Item = SkewedColumn> + 'a {
         let end_from_world: Matrix3<f32> = sensor.end.rotation().transpose().cast();
         self.columns.iter().map(move |pose| SkewedColumn {
             origin_m: end_from_world * pose.origin,
@@ -208,7 +208,7 @@ impl Caster {
     }
 
     /// Cosine and sine of the elevation of each channel.
-    pub fn elevations(&self) -> impl Iterator<Item = (f32, f32)> + '_ {
+    pub(crate) fn elevations(&self) -> impl Iterator<Item = (f32, f32)> + '_ {
         self.cos.iter().copied().zip(self.sin.iter().copied())
     }
 

@@ -47,7 +47,7 @@ pub struct Bounds {
 impl Bounds {
     /// A box from its centre and half sizes.
     #[must_use]
-    pub fn centered(center_m: [f32; 3], half_m: [f32; 3]) -> Self {
+    pub(crate) fn centered(center_m: [f32; 3], half_m: [f32; 3]) -> Self {
         Self {
             min_m: std::array::from_fn(|axis| center_m[axis] - half_m[axis]),
             max_m: std::array::from_fn(|axis| center_m[axis] + half_m[axis]),

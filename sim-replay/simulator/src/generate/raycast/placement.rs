@@ -69,7 +69,7 @@ impl Sweep {
 
     /// True if start and end are the same.
     #[must_use]
-    pub fn is_still(&self) -> bool {
+    pub(crate) fn is_still(&self) -> bool {
         self.start == self.end
     }
 

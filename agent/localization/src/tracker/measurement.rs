@@ -1,0 +1,41 @@
+//! Pose measurement: the pose of one sweep with the standard deviations that its confidence stands for.
+
+use nalgebra::Isometry3;
+
+use crate::pgc::pose_solver::FoundPose;
+
+/// Smallest standard deviation of a measured position per axis, metres: errors of one place repeat from sweep to sweep.
+const LEAST_POSITION_STD_M: f64 = 0.03;
+/// Standard deviations of a measured yaw: smallest and largest, radians.
+const YAW_STD_RAD: [f64; 2] = [0.001, 0.2];
+/// Factor on the standard deviation of the orientation: errors of neighbouring cells are correlated.
+const ROTATION_FACTOR: f64 = 4.0;
+
+/// Pose of one sweep as a measurement.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PoseMeasurement {
+    /// Capture time on the clock of the scene, nanoseconds.
+    pub capture_nanos: u64,
+    /// Measured pose.
+    pub world_from_lidar: Isometry3<f64>,
+    /// Standard deviation of the position per axis, metres.
+    pub position_std_m: f64,
+    /// Standard deviation of the yaw, radians.
+    pub yaw_std_rad: f64,
+}
+
+impl PoseMeasurement {
+    /// Measurement from an estimated pose. The variance is the squared error that its sigma stands for (Eq. 6), spread
+    /// over two axes.
+    #[must_use]
+    pub fn new(capture_nanos: u64, found: &FoundPose) -> Self {
+        let error_m: f64 = (1.0 / found.sigma.clamp(1e-6, 1.0) - 1.0).sqrt();
+        let [least, most] = YAW_STD_RAD;
+        Self {
+            capture_nanos,
+            world_from_lidar: found.world_from_sensor,
+            position_std_m: (error_m / std::f64::consts::SQRT_2).max(LEAST_POSITION_STD_M),
+            yaw_std_rad: (ROTATION_FACTOR * found.evidence.rotation_std_rad).clamp(least, most),
+        }
+    }
+}

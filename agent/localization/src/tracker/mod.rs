@@ -1,0 +1,189 @@
+//! Pose tracker: follows a vehicle from sweep to sweep with a motion filter; poses of the localizer are measurements.
+//!
+//! A measurement whose Mahalanobis distance from the prediction is too large is rejected. When several rejected ones in
+//! a row can be reached from each other, the vehicle is there: the tracker starts anew. Without measurements the
+//! covariance grows, until the vehicle counts as lost.
+
+mod measurement;
+mod motion_filter;
+
+use nalgebra::Isometry3;
+use protocol::{EgoMotion, PlanarCovariance};
+
+pub use measurement::PoseMeasurement;
+use motion_filter::MotionFilter;
+
+/// Gate of a measurement: 99.9 % quantile of the chi-square distribution with three degrees of freedom.
+const GATE: f64 = 16.27;
+/// Number of rejected measurements in a row that have to agree on another place.
+const AGREEING: usize = 3;
+/// Largest speed between rejected measurements of one vehicle, metres per second, beside [`SLACK_M`].
+const MAX_SPEED_MPS: f64 = 50.0;
+/// Largest distance between two good poses of the same place, metres.
+const SLACK_M: f64 = 2.5;
+/// Standard deviation of a speed from two poses, metres per second.
+const SPEED_STD_MPS: f64 = 3.0;
+/// Longest time between two poses that a speed is computed from, seconds.
+const SPEED_BASE_S: f64 = 1.0;
+
+/// Limits after which a vehicle counts as lost.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TrackerLimits {
+    /// Longest time without an accepted measurement, seconds.
+    pub max_coast_s: f64,
+    /// Largest standard deviation of the position along its worst direction, metres.
+    pub max_position_std_m: f64,
+}
+
+/// Tracked pose at one time.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TrackedState {
+    /// Pose of the LiDAR.
+    pub world_from_lidar: Isometry3<f64>,
+    /// Its covariance; while measurements contradict the prediction, that of both being equally likely.
+    pub covariance: PlanarCovariance,
+}
+
+/// Effect of a measurement.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Correction {
+    /// The vehicle was lost: the measurement is its pose.
+    Started,
+    /// It corrected the state.
+    Accepted,
+    /// It contradicts the prediction.
+    Rejected,
+    /// It is the last of several that contradict the prediction and agree with each other: the vehicle is there.
+    Relocated,
+}
+
+/// Follows one vehicle.
+#[derive(Debug, Clone)]
+pub struct PoseTracker {
+    limits: TrackerLimits,
+    filter: Option<MotionFilter>,
+    /// Last accepted measurement.
+    accepted: Option<PoseMeasurement>,
+    /// Rejected measurements in a row that can be reached from each other.
+    rejected: Vec<PoseMeasurement>,
+    /// Distance between the last rejected measurement and the prediction, metres.
+    contradiction_m: f64,
+}
+
+impl PoseTracker {
+    /// Tracker of a vehicle whose place is not known.
+    #[must_use]
+    pub fn new(limits: TrackerLimits) -> Self {
+        Self { limits, filter: None, accepted: None, rejected: Vec::new(), contradiction_m: 0.0 }
+    }
+
+    /// Moves the state to the capture time of a sweep. `None`: the vehicle is lost, or the clock went back.
+    pub fn predict(&mut self, capture_nanos: u64, motion: &EgoMotion) -> Option<TrackedState> {
+        if !self.can_predict(capture_nanos) {
+            self.filter = None;
+            self.rejected.clear();
+        }
+        let filter = self.filter.as_mut()?;
+        filter.advance(capture_nanos);
+        filter.correct_motion(motion);
+        if filter.planar_covariance().worst_variance_m2() > self.limits.max_position_std_m.powi(2) {
+            self.filter = None;
+        }
+        self.state()
+    }
+
+    fn can_predict(&self, capture_nanos: u64) -> bool {
+        let is_recent =
+            |accepted: &PoseMeasurement| seconds(accepted.capture_nanos, capture_nanos) <= self.limits.max_coast_s;
+        let is_ahead = self.filter.as_ref().is_some_and(|filter| filter.capture_nanos <= capture_nanos);
+        is_ahead && self.accepted.as_ref().is_some_and(is_recent)
+    }
+
+    /// Current state, if the vehicle is not lost.
+    #[must_use]
+    pub fn state(&self) -> Option<TrackedState> {
+        let filter = self.filter.as_ref()?;
+        let mut covariance = filter.planar_covariance();
+        if self.is_contradicted() {
+            // Two places that are equally likely.
+            let variance = (self.contradiction_m / 2.0).powi(2) as f32;
+            covariance.xx_m2 += variance;
+            covariance.yy_m2 += variance;
+        }
+        Some(TrackedState { world_from_lidar: filter.world_from_lidar(), covariance })
+    }
+
+    /// True if the last measurement was rejected.
+    #[must_use]
+    pub fn is_contradicted(&self) -> bool {
+        !self.rejected.is_empty()
+    }
+
+    /// Uses a measurement of the time of the last prediction.
+    pub fn correct(&mut self, measurement: &PoseMeasurement) -> Correction {
+        let Some(filter) = self.filter.as_mut() else {
+            self.start(measurement);
+            return Correction::Started;
+        };
+        if filter.capture_nanos == measurement.capture_nanos && filter.distance_squared(measurement) <= GATE {
+            filter.correct(measurement);
+            self.accepted = Some(*measurement);
+            self.rejected.clear();
+            return Correction::Accepted;
+        }
+        let off = filter.world_from_lidar().translation.vector - measurement.world_from_lidar.translation.vector;
+        self.contradiction_m = off.norm();
+        self.reject(measurement)
+    }
+
+    fn reject(&mut self, measurement: &PoseMeasurement) -> Correction {
+        if self.rejected.last().is_some_and(|before| !can_follow(before, measurement)) {
+            self.rejected.clear();
+        }
+        self.rejected.push(*measurement);
+        if self.rejected.len() < AGREEING {
+            return Correction::Rejected;
+        }
+        self.accepted = self.rejected.iter().rev().nth(1).copied();
+        self.start(measurement);
+        Correction::Relocated
+    }
+
+    /// Starts at a measurement; with the speed from the one before it, if that is recent.
+    fn start(&mut self, measurement: &PoseMeasurement) {
+        let mut filter = MotionFilter::at(measurement);
+        let before = self.accepted.replace(*measurement);
+        if let Some(before) = before.filter(|before| can_follow(before, measurement)) {
+            filter.set_speed(speed_mps(&before, measurement), SPEED_STD_MPS);
+        }
+        self.filter = Some(filter);
+        self.rejected.clear();
+    }
+
+    /// True if a measurement is needed now: the last one was rejected, or the speed is not known well.
+    #[must_use]
+    pub fn needs_measurement(&self) -> bool {
+        self.is_contradicted() || self.filter.as_ref().is_none_or(|filter| filter.speed_std_mps() > SPEED_STD_MPS)
+    }
+}
+
+/// Time from one capture to a later one, seconds; negative if it is earlier.
+fn seconds(from_nanos: u64, to_nanos: u64) -> f64 {
+    (to_nanos as f64 - from_nanos as f64) * 1e-9
+}
+
+/// True if a vehicle can be at `to` after `from`.
+fn can_follow(from: &PoseMeasurement, to: &PoseMeasurement) -> bool {
+    let time_s = seconds(from.capture_nanos, to.capture_nanos);
+    let off = to.world_from_lidar.translation.vector - from.world_from_lidar.translation.vector;
+    time_s > 0.0 && time_s <= SPEED_BASE_S && off.norm() <= SLACK_M + MAX_SPEED_MPS * time_s
+}
+
+/// Speed along the heading from one pose to the next, metres per second.
+fn speed_mps(from: &PoseMeasurement, to: &PoseMeasurement) -> f64 {
+    let moved = from.world_from_lidar.inv_mul(&to.world_from_lidar).translation.x;
+    moved / seconds(from.capture_nanos, to.capture_nanos).max(1e-3)
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,151 @@
+//! Tests of the pose tracker on simulated drives.
+
+use nalgebra::{Translation3, UnitQuaternion};
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, Normal};
+
+use super::*;
+
+const TENTH_NANOS: u64 = 100_000_000;
+const LIMITS: TrackerLimits = TrackerLimits { max_coast_s: 3.0, max_position_std_m: 2.0 };
+
+/// Pose on a drive at 10 m/s through bends, 500 km from the origin.
+fn truth(sweep: u64) -> Isometry3<f64> {
+    let (mut x, mut y, mut yaw) = (500_000.0, 5_700_000.0, 0.0_f64);
+    for step in 0..sweep * 10 {
+        yaw += 0.01 * 0.3 * (step as f64 * 0.005).sin();
+        x += 0.01 * 10.0 * yaw.cos();
+        y += 0.01 * 10.0 * yaw.sin();
+    }
+    let height = 2.0 + 0.02 * sweep as f64;
+    Isometry3::from_parts(Translation3::new(x, y, height), UnitQuaternion::from_euler_angles(0.0, 0.0, yaw))
+}
+
+fn measured(sweep: u64, off_m: [f64; 2], position_std_m: f64) -> PoseMeasurement {
+    let mut world_from_lidar = truth(sweep);
+    world_from_lidar.translation.x += off_m[0];
+    world_from_lidar.translation.y += off_m[1];
+    PoseMeasurement { capture_nanos: sweep * TENTH_NANOS, world_from_lidar, position_std_m, yaw_std_rad: 0.002 }
+}
+
+/// Planar error of the state, metres.
+fn error_m(state: &TrackedState, sweep: u64) -> f64 {
+    (state.world_from_lidar.translation.vector - truth(sweep).translation.vector).xy().norm()
+}
+
+/// Follows the drive with a measurement in every second sweep; error and bound of every prediction.
+fn followed(tracker: &mut PoseTracker, sweeps: std::ops::Range<u64>, seed: u64) -> Vec<(f64, f64)> {
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+    let noise = Normal::new(0.0, 0.1).unwrap();
+    let mut results = Vec::new();
+    for sweep in sweeps {
+        if let Some(state) = tracker.predict(sweep * TENTH_NANOS, &EgoMotion::default()) {
+            results.push((error_m(&state, sweep), state.covariance.bound_95_m()));
+        }
+        if sweep % 2 == 0 {
+            let off_m = [noise.sample(&mut random), noise.sample(&mut random)];
+            tracker.correct(&measured(sweep, off_m, 0.1));
+        }
+    }
+    results
+}
+
+fn mean(values: impl ExactSizeIterator<Item = f64>) -> f64 {
+    let count = values.len() as f64;
+    values.sum::<f64>() / count
+}
+
+#[test]
+fn predictions_are_about_as_good_as_measurements_and_stay_within_their_bounds() {
+    let (mut errors, mut exceeded) = (Vec::new(), 0);
+    for seed in 0..20 {
+        let results = followed(&mut PoseTracker::new(LIMITS), 0..100, seed);
+        // One pose says nothing of the speed: the second measurement starts again, with it.
+        assert_eq!(results.len(), 98);
+        let settled = &results[20..];
+        errors.extend(settled.iter().map(|(error_m, _)| *error_m));
+        exceeded += settled.iter().filter(|(error_m, bound_m)| error_m > bound_m).count();
+    }
+    // A measurement is off by 0.1 m in each of two axes: 0.125 m in the mean.
+    assert!(mean(errors.iter().copied()) < 0.15, "{}", mean(errors.iter().copied()));
+    assert!((exceeded as f64) < 0.05 * errors.len() as f64, "{exceeded} of {}", errors.len());
+}
+
+#[test]
+fn the_speed_that_the_vehicle_measures_is_used() {
+    let speed = EgoMotion { speed_mps: Some(10.0), yaw_rate_rad_s: None };
+    let off = |motion: &EgoMotion| {
+        let mut tracker = PoseTracker::new(LIMITS);
+        tracker.predict(0, motion);
+        tracker.correct(&measured(0, [0.0; 2], 0.05));
+        tracker.predict(TENTH_NANOS, motion).map(|state| error_m(&state, 1))
+    };
+    // The first pose says nothing of the speed.
+    assert!(off(&speed).unwrap() < 0.1);
+    assert!(off(&EgoMotion::default()).unwrap() > 0.9);
+}
+
+#[test]
+fn a_wrong_pose_does_not_pull_the_state_off() {
+    let mut tracker = PoseTracker::new(LIMITS);
+    followed(&mut tracker, 0..40, 1);
+    let predicted = tracker.predict(40 * TENTH_NANOS, &EgoMotion::default()).unwrap();
+    assert_eq!(tracker.correct(&measured(40, [30.0, 0.0], 0.1)), Correction::Rejected);
+    let doubted = tracker.state().unwrap();
+    assert_eq!(doubted.world_from_lidar, predicted.world_from_lidar);
+    assert!(tracker.is_contradicted() && doubted.covariance.bound_95_m() > 30.0, "one of both is right");
+    tracker.predict(41 * TENTH_NANOS, &EgoMotion::default()).unwrap();
+    assert_eq!(tracker.correct(&measured(41, [0.1, 0.0], 0.1)), Correction::Accepted);
+    assert!(tracker.state().unwrap().covariance.bound_95_m() < 1.0);
+}
+
+#[test]
+fn a_vehicle_that_was_carried_away_is_found_again() {
+    let mut tracker = PoseTracker::new(LIMITS);
+    followed(&mut tracker, 0..40, 1);
+    let corrections: Vec<Correction> = (40..43)
+        .map(|sweep| {
+            tracker.predict(sweep * TENTH_NANOS, &EgoMotion::default());
+            tracker.correct(&measured(sweep, [200.0, 0.0], 0.1))
+        })
+        .collect();
+    assert_eq!(corrections, [Correction::Rejected, Correction::Rejected, Correction::Relocated]);
+    let state = tracker.predict(43 * TENTH_NANOS, &EgoMotion::default()).unwrap();
+    assert!((error_m(&state, 43) - 200.0).abs() < 2.0);
+    // Poses of random places agree on none of them.
+    for sweep in 43..53 {
+        tracker.predict(sweep * TENTH_NANOS, &EgoMotion::default());
+        let off_m = [1000.0 * (sweep as f64).sin(), 900.0 * (3.0 * sweep as f64).cos()];
+        assert_eq!(tracker.correct(&measured(sweep, off_m, 0.1)), Correction::Rejected);
+    }
+}
+
+#[test]
+fn without_measurements_the_bound_grows_until_the_vehicle_is_lost() {
+    let mut tracker = PoseTracker::new(LIMITS);
+    followed(&mut tracker, 0..40, 1);
+    let mut bounds = Vec::new();
+    for sweep in 40..80 {
+        match tracker.predict(sweep * TENTH_NANOS, &EgoMotion::default()) {
+            Some(state) => {
+                assert!(error_m(&state, sweep) < state.covariance.bound_95_m().max(0.5));
+                bounds.push(state.covariance.bound_95_m());
+            }
+            None => break,
+        }
+    }
+    assert!(bounds.windows(2).all(|pair| pair[1] > pair[0]));
+    assert!((5..32).contains(&bounds.len()), "{}", bounds.len());
+    assert_eq!(tracker.correct(&measured(80, [0.0; 2], 0.1)), Correction::Started);
+}
+
+#[test]
+fn a_tunnel_and_a_restarted_scene_end_the_track() {
+    let mut tracker = PoseTracker::new(LIMITS);
+    followed(&mut tracker, 0..40, 1);
+    assert_eq!(tracker.predict(140 * TENTH_NANOS, &EgoMotion::default()), None, "ten seconds without a sweep");
+    assert_eq!(tracker.correct(&measured(140, [0.0; 2], 0.1)), Correction::Started);
+    assert!(tracker.predict(141 * TENTH_NANOS, &EgoMotion::default()).is_some());
+    assert_eq!(tracker.predict(0, &EgoMotion::default()), None, "the clock went back");
+}

@@ -1,0 +1,57 @@
+//! Pace keeper: publishes the pace of an ego to the agents.
+
+use std::time::{Duration, Instant};
+
+use bus::{Bus, BusError, Publisher, PublisherOptions};
+use protocol::{CavId, Pace, Stream, Topic};
+
+use crate::pace_control::PaceControl;
+
+/// Period at which a pace other than every sweep is repeated, for agents that join late.
+const REPEAT_PERIOD: Duration = Duration::from_secs(1);
+
+/// Controller of the pace, and its publisher.
+pub(super) struct PaceKeeper {
+    control: PaceControl,
+    publisher: Publisher,
+    pace: Pace,
+    published: Instant,
+}
+
+impl PaceKeeper {
+    pub(super) fn open(bus: &Bus, cav: &CavId) -> Result<Self, BusError> {
+        let topic = Topic::Stream { cav: cav.clone(), stream: Stream::Pace };
+        let now = Instant::now();
+        Ok(Self {
+            control: PaceControl::new(now),
+            publisher: bus.publisher(topic, PublisherOptions::POSE)?,
+            pace: Pace::EVERY_SWEEP,
+            published: now,
+        })
+    }
+
+    /// Judges a frame of the own agent; `has_waited`: it waits behind another.
+    pub(super) fn judge(&mut self, capture_nanos: u64, has_waited: bool) {
+        let Some(pace) = self.control.judge(capture_nanos, has_waited, Instant::now()) else { return };
+        let interval = Duration::from_nanos(pace.interval_nanos);
+        tracing::info!(capture_nanos, ?interval, "the pace of the fleet changes; interval 0: every sweep");
+        self.publish(pace);
+    }
+
+    /// Publishes the pace again, if it is time for that.
+    pub(super) fn repeat(&mut self) {
+        if self.pace != Pace::EVERY_SWEEP && self.published.elapsed() >= REPEAT_PERIOD {
+            self.publish(self.pace);
+        }
+    }
+
+    fn publish(&mut self, pace: Pace) {
+        self.pace = pace;
+        self.published = Instant::now();
+        self.publisher.submit(0, pace);
+    }
+
+    pub(super) fn finish(self) {
+        self.publisher.finish();
+    }
+}
