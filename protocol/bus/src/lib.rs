@@ -12,6 +12,10 @@
 //! The crate is not async: zenoh has its own runtimes, and a `put` that waits for a slow network must not block an
 //! executor. Inside tokio it needs the multi-thread runtime.
 
+// This crate reads what other processes and people wrote: an index or a cast that does not fit is an error there, not
+// a panic or another number.
+#![cfg_attr(not(test), deny(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::indexing_slicing))]
+
 mod access_control;
 mod args;
 mod batch_scheduling;

@@ -213,7 +213,10 @@ impl MessageStats {
         let Some(timings) = state.stages.get_mut(stage) else { return };
         timings.count += 1;
         timings.sum = timings.sum.saturating_add(time);
-        timings.buckets[BUCKETS_S.partition_point(|end| *end < time.as_secs_f64())] += 1;
+        let bucket = BUCKETS_S.partition_point(|end| *end < time.as_secs_f64());
+        if let Some(count) = timings.buckets.get_mut(bucket) {
+            *count += 1;
+        }
         timings.max = timings.max.max(time);
         if timings.last.len() == KEPT_TIMINGS {
             timings.last.pop_front();

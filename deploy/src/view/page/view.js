@@ -96,7 +96,7 @@ function panels(frame) {
     ms(link.clock_ms),
     number(link.trust, 2),
     link.is_fused ? "fused" : [[link.skipped || "silent", link.misbehaviour].filter(Boolean).map(words).join(": "), "bad"],
-  ]), "Nobody sends to the ego.");
+  ]), "No neighbour sends to the ego.");
   stages(frame);
   table("messages", ["topic", "sent", "used", "dropped"], messageRows(frame.messages), "Nothing counted yet.");
   const rows = frame.processes.flatMap((process) =>
