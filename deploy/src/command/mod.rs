@@ -54,7 +54,8 @@ pub(crate) enum Command {
 impl Command {
     /// Runs the subcommand.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
-        malloc_settings::ensure(&malloc_settings::KEPT_MEMORY).context("this program again")?;
+        let settings = [malloc_settings::KEPT_MEMORY.as_slice(), &[malloc_settings::ROUTER_THREADS]].concat();
+        malloc_settings::ensure(&settings).context("this program again")?;
         match self {
             Self::Demo(arguments) => arguments.run(),
             Self::Eval(arguments) => arguments.run(),

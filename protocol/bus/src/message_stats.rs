@@ -26,6 +26,29 @@ pub struct MessageStats {
     state: Arc<Mutex<State>>,
 }
 
+/// Way of a large message of a process that has a pool of shared memory.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum SharedMemoryUse {
+    /// It was in shared memory.
+    Carried,
+    /// It took the socket: the pool had no room.
+    PoolFull,
+    /// It took the socket: the router is not attached to shared memory.
+    RouterNotAttached,
+}
+
+impl SharedMemoryUse {
+    /// Its name in metrics.
+    #[must_use]
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::Carried => "carried",
+            Self::PoolFull => "pool_full",
+            Self::RouterNotAttached => "router_not_attached",
+        }
+    }
+}
+
 #[derive(Default)]
 struct State {
     ledger: Ledger,
@@ -36,6 +59,7 @@ struct State {
     rejections: BTreeMap<Topic, u64>,
     stages: BTreeMap<String, Timings>,
     peers: BTreeMap<CavId, Peer>,
+    shared: BTreeMap<SharedMemoryUse, u64>,
     is_full: bool,
 }
 
@@ -133,6 +157,33 @@ impl MessageStats {
     /// Counts an arrived message as not used.
     pub fn dropped(&self, topic: &Topic, reason: DropReason) {
         self.note(topic, |state| state.ledger.dropped(&self.here(topic), reason));
+    }
+
+    /// Counts messages that the router has taken and not handed on to this process.
+    pub(super) fn undelivered(&self, topic: &Topic, messages: u32) {
+        self.note(topic, |state| {
+            state.pass_many(self.here(topic), u64::from(messages));
+            state.ledger.dropped_many(&self.here(topic), DropReason::Undelivered, u64::from(messages));
+        });
+    }
+
+    /// Counts a large message of a process with a pool of shared memory; the first on the socket is logged.
+    pub(super) fn shared(&self, way: SharedMemoryUse) {
+        let is_first = {
+            let mut state = self.lock();
+            let count = state.shared.entry(way).or_default();
+            *count += 1;
+            *count == 1
+        };
+        if is_first && way != SharedMemoryUse::Carried {
+            tracing::warn!(reason = way.as_str(), "a large message takes the socket instead of shared memory");
+        }
+    }
+
+    /// Large messages of a process with a pool of shared memory, by their way.
+    #[must_use]
+    pub fn shared_memory(&self) -> BTreeMap<SharedMemoryUse, u64> {
+        self.lock().shared.clone()
     }
 
     /// Counts an arrived message as malformed; logged ever more rarely, as a hostile peer must not fill the log.
@@ -296,7 +347,11 @@ impl State {
     }
 
     fn pass(&mut self, account: Account) {
-        *self.passed.entry(account).or_default() += 1;
+        self.pass_many(account, 1);
+    }
+
+    fn pass_many(&mut self, account: Account, messages: u64) {
+        *self.passed.entry(account).or_default() += messages;
     }
 }
 

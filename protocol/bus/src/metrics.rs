@@ -93,6 +93,15 @@ impl Collector for StatsCollector {
             let labels = [("topic", topic.as_str()), ("side", side)];
             ConstGauge::new(count).encode(in_flight.encode_family(&labels)?)?;
         }
+        let mut shared = encoder.encode_descriptor(
+            "shared_memory_messages",
+            "Large messages of a process with a pool of shared memory, by their way",
+            None,
+            MetricType::Counter,
+        )?;
+        for (way, count) in self.0.shared_memory() {
+            ConstCounter::new(count).encode(shared.encode_family(&[("way", way.as_str())])?)?;
+        }
         let seconds = Unit::Seconds;
         let peers = self.0.peers();
         let mut clocks = encoder.encode_descriptor(
