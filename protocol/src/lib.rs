@@ -120,8 +120,8 @@ pub use ledger::{Account, Counts, Ledger};
 pub use limits::Limits;
 pub use message::{
     AgentTruth, Bev, Boxes, Control, Descriptor, Detections, DetectionsReport, FusedNeighbour, Gnss, GnssSource,
-    HeardNeighbour, Kind, Lidar, Message, ModelHash, NoPoseReason, Payload, Points, PoseEstimate, Radar,
-    SkippedNeighbour, StageSummary, StageTiming, Stats, TopicCount, TrueObject, Truth,
+    HeardNeighbour, Kind, Lidar, Message, ModelHash, NoPoseReason, Payload, Points, PoseEstimate, ProcessUsage, Radar,
+    SkippedNeighbour, StageSummary, StageTiming, Stats, TopicCount, TopicTraffic, TrueObject, Truth,
 };
 pub use misbehaviour_reason::MisbehaviourReason;
 pub use point_cloud::{Handedness, PointCloud};

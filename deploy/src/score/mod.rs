@@ -10,11 +10,12 @@ mod node;
 mod numbered_results;
 pub mod offline_intervals;
 mod open_ticks;
+mod precision;
 mod result_lines;
 mod stage_stamps;
 mod true_boxes;
 
-pub use frame_record::{FrameRecord, JudgedFrame};
+pub use frame_record::{FrameRecord, JudgedFrame, StreamedResult};
 pub use frame_scores::FrameScores;
 pub use neighbours::NeighbourRecord;
 pub use node::{ProcessBooks, Progress, Scored, ScorerError, ScorerNode, scorer_cav};

@@ -7,10 +7,10 @@ use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use bus::bounded_queue::Pop;
-use bus::{Arrival, Bus, BusError, Event, Identity, Inbox, LivelinessToken, Subscription, process_id};
+use bus::{Arrival, Bus, BusError, Event, Identity, Inbox, LivelinessToken, Subscription, process_id, process_usage};
 use protocol::{
-    CavId, Detections, DetectionsReport, HeardNeighbour, KeyExpr, Ledger, Limits, PoseEstimate, ProcessId, Role, RunId,
-    StageSummary, Stats, Stream, Topic, Truth,
+    CavId, Detections, DetectionsReport, HeardNeighbour, KeyExpr, Ledger, Limits, PoseEstimate, ProcessId,
+    ProcessUsage, Role, RunId, StageSummary, Stats, Stream, Topic, TopicTraffic, Truth,
 };
 use zenoh::Session;
 
@@ -61,7 +61,7 @@ impl Progress {
     }
 }
 
-/// Ledger of one process instance.
+/// Ledger and resources of one process instance.
 #[derive(Debug, Clone)]
 pub struct ProcessBooks {
     /// Name of the process.
@@ -70,6 +70,12 @@ pub struct ProcessBooks {
     pub ledger: Ledger,
     /// Its stages.
     pub stages: Vec<StageSummary>,
+    /// Its CPU time and memory.
+    pub usage: ProcessUsage,
+    /// CPU time before the first tick, seconds: for loading models and for joining the run.
+    pub cpu_before_s: f64,
+    /// Its published bytes, by topic.
+    pub traffic: Vec<TopicTraffic>,
 }
 
 /// Largest number of process instances whose ledgers are kept: a fleet of 65 vehicles that all crash a few times.
@@ -193,10 +199,16 @@ impl ScorerNode {
     pub fn finish(self) -> Scored {
         self.inbox.close();
         let (board, books, unwritten) = self.thread.join().expect("the scorer's thread has no reason to panic");
+        let stats = self.bus.books();
+        let process = self.bus.identity().process.clone();
+        let cpu_before_s = books.values().find(|books| books.process == process).map_or(0.0, |own| own.cpu_before_s);
         let own = ProcessBooks {
-            process: self.bus.identity().process.clone(),
-            ledger: self.bus.books().ledger(),
-            stages: self.bus.books().stages(),
+            process,
+            ledger: stats.ledger(),
+            stages: stats.stages(),
+            usage: process_usage(),
+            cpu_before_s,
+            traffic: stats.traffic(),
         };
         let progress = self.progress.lock().unwrap_or_else(PoisonError::into_inner).clone();
         drop((self._subscriptions, self._presence, self.offline));
@@ -270,6 +282,7 @@ impl Worker {
         self.numbered.tick(stamp.capture_nanos, truth.tick);
         self.board.truth(stamp, truth);
         self.write_results(false);
+        self.bus_stats.tick();
         self.note(|progress| progress.ticks += 1);
         Some(())
     }
@@ -284,6 +297,8 @@ impl Worker {
         let heard = result.heard.clone();
         let (fused, bytes) =
             (result.fused.len(), result.fused.iter().map(|neighbour| neighbour.wire_bytes).sum::<u64>());
+        let latency = latency_ms.map(|ms| Duration::from_secs_f64(ms.max(0.0) / 1e3));
+        self.bus_stats.answered(latency, fused);
         let at = arrival.at;
         self.note(|progress| {
             progress.frames += 1;
@@ -311,7 +326,10 @@ impl Worker {
     }
 
     fn stats(&mut self, sender: &ProcessId, arrival: &Arrival) {
-        let Some(Stats { process, ledger, stages }) = self.inbox.decode(arrival, &Limits::DEFAULT) else { return };
+        let Some(Stats { process, ledger, stages, usage, traffic }) = self.inbox.decode(arrival, &Limits::DEFAULT)
+        else {
+            return;
+        };
         // A restarted process has another epoch: both instances count.
         let instance = (process.clone(), arrival.header.stamp.epoch);
         let has_room = self.books.len() < MAX_INSTANCES || self.books.contains_key(&instance);
@@ -319,7 +337,13 @@ impl Worker {
             return tracing::warn!(%sender, %process, "report with another process's name, or of too many processes: ignored");
         }
         let (name, at) = (process.to_string(), arrival.at);
-        self.books.insert(instance, ProcessBooks { process, ledger, stages });
+        // Until the first tick: the loading of models belongs to no frame.
+        let cpu_before_s = match self.published.is_empty() {
+            true => usage.cpu_s,
+            false => self.books.get(&instance).map_or(0.0, |known| known.cpu_before_s),
+        };
+        let books = ProcessBooks { process, ledger, stages, usage, cpu_before_s, traffic };
+        self.books.insert(instance, books);
         let dropped = self.books.values().map(|books| books.ledger.total().dropped_total()).sum();
         self.note(|progress| {
             progress.dropped = dropped;

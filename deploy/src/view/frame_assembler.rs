@@ -112,7 +112,7 @@ impl FrameAssembler {
     }
 
     fn keep_ledger(&mut self, seen: &Seen<'_>) {
-        let Some(Stats { process, ledger, stages }) = decode(seen) else { return };
+        let Some(Stats { process, ledger, stages, .. }) = decode(seen) else { return };
         let process = process.to_string();
         if self.ledgers.len() < MOST_LEDGERS || self.ledgers.contains_key(&process) {
             self.ledgers.insert(process, (ledger, stages));

@@ -31,7 +31,7 @@ pub use descriptor::{Descriptor, ModelHash};
 pub use detections::{Detections, DetectionsReport, FusedNeighbour, HeardNeighbour, SkippedNeighbour};
 pub use gnss::{Gnss, GnssSource};
 pub use pose_estimate::{NoPoseReason, PoseEstimate};
-pub use stats::{StageSummary, StageTiming, Stats};
+pub use stats::{ProcessUsage, StageSummary, StageTiming, Stats, TopicTraffic};
 pub use sweep::{Lidar, Points, PointsMetadata, Radar, SweepMetadata};
 pub use table::{Kind, Message};
 pub(crate) use table::{MessageSource, MessageVisitor};
