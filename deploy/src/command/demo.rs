@@ -72,7 +72,7 @@ impl Arguments {
             let options = UpOptions { runs: self.runs.clone(), programs: programs()?, prefix: "demo" };
             let result = up(&scenario, &options).with_context(|| format!("method {method}"))?;
             if !self.json {
-                output::text(report::run_report(&result))?;
+                output::line(report::run_report(&result))?;
             }
             let interrupted = result.interrupted;
             results.push(result);

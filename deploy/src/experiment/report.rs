@@ -12,16 +12,16 @@ use crate::run::loss;
 use crate::run::run_fleet::RunResult;
 use crate::score::metrics::{ByIou, Contribution, Metrics, Percentiles};
 
-/// Report and table of a run: pace, stages, resources, then detections, latency, bytes.
+/// Table and report of a run: detections, latency, bytes, then pace, stages and resources.
 #[must_use]
 pub fn run_table(result: &RunResult) -> String {
-    run_report(result) + &table(std::slice::from_ref(&result.metrics)) + &run_notes(result)
+    table(std::slice::from_ref(&result.metrics)) + &run_report(result) + &run_notes(result)
 }
 
 /// Pace, stages, CPU, memory and bytes of a run, under its method.
 #[must_use]
 pub fn run_report(result: &RunResult) -> String {
-    format!("\n{} in {}\n{}\n", result.metrics.method, result.folder.path().display(), result.report)
+    format!("\n{} in {}\n{}", result.metrics.method, result.folder.path().display(), result.report)
 }
 
 /// Prints the reasons for exit code 3 to standard error, `with_method` under the method of the run.

@@ -21,13 +21,13 @@ pub fn sentence(result: &RunResult) -> Option<String> {
 fn reasons(result: &RunResult) -> Vec<String> {
     let mut reasons = Vec::new();
     if result.missed > 0 {
-        reasons.push(format!("{} of {} ticks are unanswered", result.missed, result.metrics.ticks));
+        reasons.push(format!("{} of {} ticks unanswered", result.missed, result.metrics.ticks));
     }
     let messages = &result.metrics.messages;
     let dropped = messages.dropped.iter().filter(|(reason, count)| reason.is_loss() && **count > 0);
     let dropped: Vec<String> = dropped.map(|(reason, count)| format!("{count} {}", spoken(*reason))).collect();
     if !dropped.is_empty() {
-        reasons.push(format!("messages are lost ({})", dropped.join(", ")));
+        reasons.push(format!("messages lost ({})", dropped.join(", ")));
     }
     if messages.are_stuck() {
         reasons.push("most messages were still in flight at the end".into());
@@ -49,6 +49,8 @@ fn help(result: &RunResult) -> Option<String> {
     let log = |folder: &Path| format!("see {}", folder.join("log").display());
     if !result.unwritten.is_empty() {
         Some("free disk space".into())
+    } else if result.interrupted {
+        Some("the run was ended before its time".into())
     } else if !result.failures.is_empty() || !result.crashed.is_empty() {
         let crashed = match &result.crashed[..] {
             [] => String::new(),

@@ -40,6 +40,9 @@ const DRAIN_SHARE: f64 = 0.5;
 /// For writing the index of a recording, after all others have ended.
 const RECORDER_SHARE: Duration = Duration::from_millis(800);
 
+/// Files of results and of ground truth, a line each.
+const LINES: [&str; 2] = ["detections.jsonl", "truth.jsonl"];
+
 /// Settings of a run beside its scenario.
 #[derive(Debug, Clone)]
 pub struct UpOptions {
@@ -99,8 +102,7 @@ pub fn up(scenario: &Scenario, options: &UpOptions) -> Result<RunResult, RunErro
     let fleet = Fleet::plan(scenario)?;
     let run = fleet.scenario.run.clone().unwrap_or_else(|| name_of_now(options.prefix));
     let folder = RunFolder::create(&options.runs, &run)?;
-    let capacity = announce_capacity(&fleet);
-    let result = go(&fleet, options, (&run, &folder), capacity);
+    let result = go(&fleet, options, &run, &folder);
     if result.as_ref().is_err_and(RunError::is_refusal) {
         folder.remove();
     }
@@ -121,14 +123,11 @@ fn announce_capacity(fleet: &Fleet) -> Option<Capacity> {
 }
 
 /// Runs a fleet under the given run name in the given folder.
-fn go(
-    fleet: &Fleet,
-    options: &UpOptions,
-    (run, folder): (&RunId, &RunFolder),
-    capacity: Option<Capacity>,
-) -> Result<RunResult, RunError> {
+fn go(fleet: &Fleet, options: &UpOptions, run: &RunId, folder: &RunFolder) -> Result<RunResult, RunError> {
     let stop = Stop::new();
     stop.on_signals().map_err(RunError::Signals)?;
+    // Before anything else of the run takes the cores.
+    let capacity = announce_capacity(fleet);
     let fingerprint = fingerprint(fleet, &options.programs);
 
     let keys = fleet.keys(folder)?;
@@ -139,8 +138,8 @@ fn go(
     place.check_free(&fleet.scenario.network, run, &specs)?;
     let refused = RefusalWatch::over(&place)?;
     let board = FrameScores::new(fleet.ego.clone(), fleet.ground_truth_rule(), fleet.map_values());
-    let detections = folder.file("detections.jsonl");
-    let mut scorer = ScorerNode::start(place.session.clone(), run, &fleet.agents, &fleet.ego, board, detections)?;
+    let files = LINES.map(|name| folder.file(name));
+    let mut scorer = ScorerNode::start(place.session.clone(), run, &fleet.agents, &fleet.ego, board, files)?;
     if let Some(address) = fleet.scenario.network.metrics {
         scorer.serve_metrics(address)?;
     }
@@ -288,8 +287,8 @@ fn write(
 ) -> RunResult {
     let Scored { board, books, progress, unwritten: lines } = scored;
     let mut unwritten = Vec::new();
-    if lines > 0 {
-        unwritten.push(format!("{lines} results are missing in {}", folder.file("detections.jsonl").display()));
+    for (name, lines) in LINES.iter().zip(lines).filter(|(_, lines)| *lines > 0) {
+        unwritten.push(format!("{lines} lines are missing in {}", folder.file(name).display()));
     }
     let mut note = |written: Result<(), RunFolderError>| {
         if let Err(error) = written {

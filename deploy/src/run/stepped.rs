@@ -27,9 +27,9 @@ use crate::run::report::{self, RunReport};
 use crate::run::run_fleet::{RunResult, UpOptions};
 use crate::scenario::fingerprint::Provenance;
 use crate::scenario::{Scenario, Stepped};
-use crate::score::FrameScores;
 use crate::score::evaluated_frame::judge;
 use crate::score::metrics::Metrics;
+use crate::score::{FrameScores, TruthLine};
 
 /// Runs a scenario in simulation time to its end.
 ///
@@ -148,18 +148,33 @@ fn play(
     let path = folder.file("detections.jsonl");
     let unwritable = |source| RunFolderError::Write { path: path.clone(), source };
     let mut file = BufWriter::new(File::create(&path).map_err(unwritable)?);
+    let mut truth = BufWriter::new(File::create(folder.file("truth.jsonl")).map_err(unwritable)?);
     let bar = progress::bar(fleet.ticks.unwrap_or(0), "ticks");
     let mut written = Ok(());
     let _ = evaluator.run(recorded, &mut |frame: EvaluatedFrame| {
         bar.inc(1);
         let report = DetectionsReport::new(&frame.stamp, Some(frame.tick as u64), frame.result.clone());
-        written = writeln!(file, "{}", report.to_json());
+        let of_truth = truth_line(&fleet.ego, &frame).to_json();
+        written = writeln!(file, "{}", report.to_json()).and_then(|()| writeln!(truth, "{of_truth}"));
         judge(&mut board, frame, true);
         if written.is_ok() { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
     })?;
     bar.finish_and_clear();
-    written.and_then(|()| file.flush()).map_err(unwritable)?;
+    written.and_then(|()| file.flush()).and_then(|()| truth.flush()).map_err(unwritable)?;
     Ok(board)
+}
+
+/// Ground truth of a computed tick.
+fn truth_line(ego: &CavId, frame: &EvaluatedFrame) -> TruthLine {
+    let own = frame.frames.iter().find(|recorded| recorded.cav == *ego);
+    TruthLine {
+        tick: frame.tick as u64,
+        capture_nanos: frame.stamp.capture_nanos,
+        publish_nanos: frame.stamp.capture_nanos,
+        ego: ego.clone(),
+        world_from_ego: own.and_then(|recorded| recorded.world_from_lidar),
+        boxes: frame.objects.clone(),
+    }
 }
 
 fn write(

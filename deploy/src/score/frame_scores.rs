@@ -13,6 +13,7 @@ use super::open_ticks::{OpenTicks, Part, Tick};
 use super::precision::{by_iou, found_by_last};
 use super::stage_stamps::StageStamps;
 use super::true_boxes::true_boxes;
+use super::truth_line::TruthLine;
 use crate::score::metrics::{ByIou, Communication, Latencies, Percentiles, PoseError, PoseErrors};
 
 /// Gap between two frames beyond which they belong to two scenarios, nanoseconds.
@@ -61,6 +62,20 @@ impl FrameScores {
     pub fn change_ego(&mut self, ego: &CavId) {
         self.ego.clone_from(ego);
         self.live.forget();
+    }
+
+    /// The ground truth of a tick as it is scored; `None` where the ego takes no part.
+    #[must_use]
+    pub fn truth_line(&self, stamp: &Stamp, truth: &Truth) -> Option<TruthLine> {
+        let ego = truth.agents.iter().find(|agent| agent.cav == self.ego)?;
+        Some(TruthLine {
+            tick: truth.tick,
+            capture_nanos: stamp.capture_nanos,
+            publish_nanos: stamp.publish_nanos,
+            ego: self.ego.clone(),
+            world_from_ego: Some(ego.world_from_lidar),
+            boxes: true_boxes(truth, &self.ego, &self.rule),
+        })
     }
 
     /// Adds the ground truth of a tick.

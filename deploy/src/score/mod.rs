@@ -14,6 +14,7 @@ mod precision;
 mod result_lines;
 mod stage_stamps;
 mod true_boxes;
+mod truth_line;
 
 pub use frame_record::{FrameRecord, JudgedFrame, StreamedResult};
 pub use frame_scores::FrameScores;
@@ -21,3 +22,4 @@ pub use neighbours::NeighbourRecord;
 pub use node::{ProcessBooks, Progress, Scored, ScorerError, ScorerNode, scorer_cav};
 pub use stage_stamps::StageStamps;
 pub use true_boxes::true_boxes;
+pub use truth_line::TruthLine;

@@ -92,8 +92,8 @@ pub struct Scored {
     pub books: Vec<ProcessBooks>,
     /// Progress of the run.
     pub progress: Progress,
-    /// Number of results that are not in the file, for lack of disk space.
-    pub unwritten: u64,
+    /// Number of results and of ticks that are not in their files, for lack of disk space.
+    pub unwritten: [u64; 2],
 }
 
 /// Reason why the scorer cannot start.
@@ -117,15 +117,15 @@ pub struct ScorerNode {
     bus: Bus,
     inbox: Arc<Inbox>,
     progress: Arc<Mutex<Progress>>,
-    thread: JoinHandle<(FrameScores, ScoreStats, u64)>,
+    thread: JoinHandle<(FrameScores, ScoreStats, [u64; 2])>,
     offline: OfflineIntervals,
     _subscriptions: Vec<Subscription>,
     _presence: LivelinessToken,
 }
 
 impl ScorerNode {
-    /// Subscribes to the run of `agents` on `session`; results are appended to `detections_file`, one JSON object a
-    /// line.
+    /// Subscribes to the run of `agents` on `session`; results and ground truth are appended to `files`, one JSON object
+    /// a line.
     ///
     /// # Errors
     /// [`ScorerError`] when the bus, the file or the system refuses.
@@ -135,7 +135,7 @@ impl ScorerNode {
         agents: &[CavId],
         ego: &CavId,
         board: FrameScores,
-        detections_file: PathBuf,
+        files: [PathBuf; 2],
     ) -> Result<Self, ScorerError> {
         let cav = scorer_cav();
         let process = process_id(Role::Scorer, &cav);
@@ -153,7 +153,9 @@ impl ScorerNode {
         let presence = bus.announce(Role::Scorer)?;
         let offline = OfflineIntervals::watch(&bus)?;
         let io = |what: String| move |source| ScorerError::Io { what, source };
-        let detections = ResultLines::create(&detections_file).map_err(io(detections_file.display().to_string()))?;
+        let lines = |file: &PathBuf| ResultLines::create(file).map_err(io(file.display().to_string()));
+        let [detections, truth] = &files;
+        let (detections, truth_lines) = (lines(detections)?, lines(truth)?);
         let progress = Arc::<Mutex<Progress>>::default();
         let worker = Worker {
             inbox: Arc::clone(&inbox),
@@ -162,6 +164,7 @@ impl ScorerNode {
             books: BTreeMap::new(),
             progress: Arc::clone(&progress),
             detections,
+            truth_lines,
             numbered: NumberedResults::default(),
             published: BTreeMap::new(),
         };
@@ -238,13 +241,14 @@ struct Worker {
     books: ScoreStats,
     progress: Arc<Mutex<Progress>>,
     detections: ResultLines,
+    truth_lines: ResultLines,
     numbered: NumberedResults,
     // Time of publication of each recent tick, by capture time: for the latency that is displayed during the run.
     published: BTreeMap<u64, u64>,
 }
 
 impl Worker {
-    fn run(mut self) -> (FrameScores, ScoreStats, u64) {
+    fn run(mut self) -> (FrameScores, ScoreStats, [u64; 2]) {
         loop {
             match self.inbox.take(None) {
                 Pop::Item(topic, Event::Message(arrival)) => self.take(&topic, &arrival),
@@ -255,7 +259,7 @@ impl Worker {
         }
         self.write_results(true);
         self.board.close();
-        (self.board, self.books, self.detections.finish())
+        (self.board, self.books, [self.detections.finish(), self.truth_lines.finish()])
     }
 
     fn take(&mut self, topic: &Topic, arrival: &Arrival) {
@@ -280,6 +284,9 @@ impl Worker {
             self.published.pop_first();
         }
         self.numbered.tick(stamp.capture_nanos, truth.tick);
+        if let Some(line) = self.board.truth_line(stamp, &truth) {
+            self.truth_lines.add(line.to_json());
+        }
         self.board.truth(stamp, truth);
         self.write_results(false);
         self.bus_stats.tick();
@@ -315,7 +322,7 @@ impl Worker {
     /// Writes the results whose tick is known, or will not be.
     fn write_results(&mut self, is_over: bool) {
         while let Some(report) = self.numbered.next(is_over) {
-            self.detections.add(&report);
+            self.detections.add(report.to_json());
         }
     }
 
