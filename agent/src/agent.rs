@@ -146,8 +146,8 @@ impl Agent {
     /// [`DetectorError::Shape`] if it is not a feature map of this detector.
     pub fn perceive_map(&mut self, map: &Tensor) -> Result<Perception, DetectorError> {
         let mut times = StageTimes::start();
-        let sent = self.detector.squeezed(map)?;
-        let (map, features) = (self.detector.widened(&sent)?, self.detector.to_message(&sent)?);
+        let sent = self.detector.compressed(map)?;
+        let (map, features) = (self.detector.decompressed(&sent)?, self.detector.to_message(&sent)?);
         times.lap("message");
         let heads = self.detector.heads(&map)?;
         times.lap("head");
@@ -224,7 +224,7 @@ mod tests {
         let mut agent = agent_with(Some(4));
         let cloud = PointCloud { xyzi: (0..500).map(|k| [(k % 83) as f32 * 0.1 + 3.0, 0.5, -1.5, 0.2]).collect() };
         let encoded = agent.detector.encode(&cloud).unwrap().features;
-        let shared = agent.detector.to_message(&agent.detector.squeezed(&encoded).unwrap()).unwrap();
+        let shared = agent.detector.to_message(&agent.detector.compressed(&encoded).unwrap()).unwrap();
         let received = agent.detector.received(&DecodedFeatures { features: shared.clone(), sent: None }).unwrap();
         let heads = agent.detector.heads(&received).unwrap();
         let seen = agent.perceive(&cloud).unwrap();

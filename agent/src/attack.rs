@@ -58,10 +58,10 @@ impl Falsification {
 #[serde(deny_unknown_fields)]
 pub struct AttackConfig {
     /// Kind of falsification.
-    pub lie: Falsification,
+    pub falsification: Falsification,
     /// Number of attackers: the first neighbours of every scenario.
     #[serde(default = "one")]
-    pub liars: usize,
+    pub attackers: usize,
     /// Seed of the falsification.
     #[serde(default)]
     pub seed: u64,
@@ -75,7 +75,7 @@ impl AttackConfig {
     /// The attack of the vehicle at `place` of its scenario, the ego being at 0; none if it is honest.
     #[must_use]
     pub fn of(&self, place: usize, cav: &CavId) -> Option<Attack> {
-        (1..=self.liars).contains(&place).then(|| Attack::new(self.lie, cav, self.seed))
+        (1..=self.attackers).contains(&place).then(|| Attack::new(self.falsification, cav, self.seed))
     }
 }
 
@@ -93,7 +93,7 @@ pub struct CapturedMessages {
 /// State of an attacker.
 #[derive(Debug)]
 pub struct Attack {
-    lie: Falsification,
+    falsification: Falsification,
     random: SplitMix64,
     offset_m: [f64; 2],
     /// Poses of the synthetic objects in the attacker's frame: x and y in metres, heading in radians.
@@ -104,7 +104,7 @@ pub struct Attack {
 impl Attack {
     /// The attack of the vehicle `cav` under `seed`.
     #[must_use]
-    pub fn new(lie: Falsification, cav: &CavId, seed: u64) -> Self {
+    pub fn new(falsification: Falsification, cav: &CavId, seed: u64) -> Self {
         let letters: Vec<u64> = cav.as_str().bytes().map(u64::from).collect();
         let mut random = SplitMix64::derived(seed, &letters);
         let (distance_m, direction) = (random.between(5.0, 30.0), random.between(0.0, std::f64::consts::TAU));
@@ -114,13 +114,13 @@ impl Attack {
         };
         let places = (0..INVENTED).map(|_| place(&mut random)).collect();
         let offset_m = [distance_m * direction.cos(), distance_m * direction.sin()];
-        tracing::warn!(%cav, lie = lie.name(), "ATTACK: this vehicle falsifies its messages");
-        Self { lie, random, offset_m, places, captured: CapturedMessages::default() }
+        tracing::warn!(%cav, falsification = falsification.name(), "ATTACK: this vehicle falsifies its messages");
+        Self { falsification, random, offset_m, places, captured: CapturedMessages::default() }
     }
 
     /// Stores another vehicle's messages, for [`Falsification::Copied`].
-    pub fn overhear(&mut self, captured: CapturedMessages) {
-        if self.lie == Falsification::Copied {
+    pub fn capture(&mut self, captured: CapturedMessages) {
+        if self.falsification == Falsification::Copied {
             self.captured = captured;
         }
     }
@@ -136,7 +136,7 @@ impl Attack {
 impl OutputFilter for Attack {
     /// The pose that is published instead of the vehicle's own.
     fn pose(&self, pose: PoseEstimate) -> PoseEstimate {
-        let (Falsification::ShiftedPose, Some(own)) = (self.lie, pose.world_from_cav()) else { return pose };
+        let (Falsification::ShiftedPose, Some(own)) = (self.falsification, pose.world_from_cav()) else { return pose };
         let [x, y, z] = own.translation_m;
         let [dx, dy] = self.offset_m;
         PoseEstimate::new(Pose { translation_m: [x + dx, y + dy, z], ..*own }, 1.0)
@@ -145,7 +145,7 @@ impl OutputFilter for Attack {
     /// The perception that is published instead of the true one.
     fn perception(&mut self, truth: Perception) -> Perception {
         let mut falsified = truth;
-        match self.lie {
+        match self.falsification {
             Falsification::ShiftedPose => {}
             Falsification::Noise => {
                 make_noise(&mut falsified.features, &mut self.random);
@@ -169,7 +169,7 @@ impl OutputFilter for Attack {
 
     /// The points that are published instead of the measured ones.
     fn points(&mut self, truth: PointCloud) -> PointCloud {
-        match self.lie {
+        match self.falsification {
             Falsification::ShiftedPose => truth,
             Falsification::Noise => {
                 let random = &mut self.random;
@@ -289,12 +289,12 @@ mod tests {
 
     #[test]
     fn falsified_output_has_the_shape_of_the_truth_and_other_values() {
-        for lie in [Falsification::Noise, Falsification::Invented] {
-            let falsified = Attack::new(lie, &cav("a"), 1).perception(truth());
+        for falsification in [Falsification::Noise, Falsification::Invented] {
+            let falsified = Attack::new(falsification, &cav("a"), 1).perception(truth());
             assert_eq!(falsified.features.values.len(), truth().features.values.len());
             assert!(
                 falsified.features.values != truth().features.values && !falsified.detections.is_empty(),
-                "{lie:?}"
+                "{falsification:?}"
             );
             assert!(falsified.features.values.iter().all(|value| value.is_finite()));
         }
@@ -313,7 +313,7 @@ mod tests {
         assert_eq!(attack.perception(truth()).features, truth().features);
         assert_eq!(attack.perception(later()).features, truth().features);
         let captured = CapturedMessages { features: Some(later().features), ..CapturedMessages::default() };
-        attack.overhear(captured);
+        attack.capture(captured);
         assert_eq!(attack.perception(truth()).features, later().features);
     }
 }

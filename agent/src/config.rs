@@ -79,7 +79,7 @@ pub struct AgentSettings {
     /// Falsification of the vehicle's messages, to measure its effect on the ego. Absent: none.
     #[arg(long, value_enum, help_heading = "Attack")]
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub lie: Option<Falsification>,
+    pub falsification: Option<Falsification>,
 }
 
 /// A message beside the pose.

@@ -180,7 +180,7 @@ impl<'a> Node<'a> {
         if arrival.topic == self.lidar {
             let superseded = self.pairing.add_sweep(capture_nanos, arrival, Instant::now());
             if superseded.is_some() {
-                self.bus.books().dropped(&self.lidar, DropReason::Superseded);
+                self.bus.stats().dropped(&self.lidar, DropReason::Superseded);
             }
         } else if let Some(Gnss { world_from_lidar, .. }) = self.inbox.decode(&arrival, &self.options.limits) {
             let displaced = self.pairing.add_pose(capture_nanos, world_from_lidar);
@@ -190,19 +190,19 @@ impl<'a> Node<'a> {
 
     fn drop_poses(&self, count: usize) {
         // Their sweeps were superseded, and they with them.
-        (0..count).for_each(|_| self.bus.books().dropped(&self.gnss, DropReason::Superseded));
+        (0..count).for_each(|_| self.bus.stats().dropped(&self.gnss, DropReason::Superseded));
     }
 
     fn advance(&mut self, now: Instant) {
         while let Some((PairedSweep { capture_nanos, sweep, pose }, unused)) = self.pairing.next(now) {
             self.drop_poses(unused);
             if pose.is_some() {
-                self.bus.books().received(&self.gnss);
+                self.bus.stats().received(&self.gnss);
             }
             let transport = unix_nanos().saturating_sub(sweep.header.stamp.publish_nanos);
             let Some(Lidar { points }) = self.inbox.decode(&sweep, &self.options.limits) else { continue };
-            self.bus.books().timed("lidar transport", Duration::from_nanos(transport));
-            self.bus.books().received(&self.lidar);
+            self.bus.stats().timed("lidar transport", Duration::from_nanos(transport));
+            self.bus.stats().received(&self.lidar);
             let arrived_nanos = unix_nanos().saturating_sub(nanos::of(sweep.at.elapsed()));
             self.process(&AgentInput { capture_nanos, cloud: &points, measured_pose: pose.as_ref() });
             // Logged after everything is submitted.
@@ -214,27 +214,27 @@ impl<'a> Node<'a> {
     }
 
     fn process(&mut self, input: &AgentInput<'_>) {
-        let books = self.bus.books();
+        let stats = self.bus.stats();
         let began = Instant::now();
         let pose = self.filter.pose(self.agent.estimate_pose(input));
-        books.timed("pose", began.elapsed());
-        self.publishers.pose.offer(input.capture_nanos, pose);
+        stats.timed("pose", began.elapsed());
+        self.publishers.pose.submit(input.capture_nanos, pose);
         for stage in self.agent.pose_stages() {
-            books.timed(&stage.stage, Duration::from_nanos(stage.nanos));
+            stats.timed(&stage.stage, Duration::from_nanos(stage.nanos));
         }
         self.report.no_pose += u64::from(pose.world_from_cav().is_none());
         self.report.pose_jumps = self.agent.pose_jumps();
         match self.agent.perceive(input.cloud) {
             Ok(perception) => {
                 for stage in &perception.times {
-                    books.timed(&stage.stage, Duration::from_nanos(stage.nanos));
+                    stats.timed(&stage.stage, Duration::from_nanos(stage.nanos));
                 }
-                books.timed("agent", began.elapsed());
+                stats.timed("agent", began.elapsed());
                 self.report.sweeps += 1;
                 let perception = self.filter.perception(perception);
                 let shared = self.publishers.points.is_some().then(|| self.agent.share_points(input.cloud));
                 let shared = shared.map(|points| self.filter.points(points));
-                self.publishers.offer(input, pose, perception, shared, books);
+                self.publishers.submit(input, pose, perception, shared, stats);
             }
             Err(error) => {
                 self.report.failed += 1;
@@ -292,40 +292,40 @@ impl Publishers {
         let now = Instant::now();
         if now >= self.next_descriptor {
             self.next_descriptor = now + DESCRIPTOR_PERIOD;
-            self.descriptor.offer(0, self.description.clone());
+            self.descriptor.submit(0, self.description.clone());
         }
     }
 
-    fn offer(
+    fn submit(
         &mut self,
         input: &AgentInput<'_>,
         pose: PoseEstimate,
         perception: Perception,
         shared: Option<PointCloud>,
-        books: &MessageStats,
+        stats: &MessageStats,
     ) {
         let Perception { features, confidence, detections, .. } = perception;
         if let Some(bev) = &self.bev {
-            let (codec, rate, books, topic) = (self.codec, Arc::clone(&self.rate), books.clone(), bev.topic().clone());
-            let (number, offered, capture_nanos) = (self.submitted, Instant::now(), input.capture_nanos);
+            let (codec, rate, stats, topic) = (self.codec, Arc::clone(&self.rate), stats.clone(), bev.topic().clone());
+            let (number, submitted, capture_nanos) = (self.submitted, Instant::now(), input.capture_nanos);
             self.submitted += 1;
             // The choice of format, selection, quantisation and compression run on the sending thread, at the map's
             // turn.
-            bev.offer_encoded(capture_nanos, move |stamp| {
-                let turn = Turn { number, offered, begun: Instant::now() };
+            bev.submit_encoded(capture_nanos, move |stamp| {
+                let turn = Turn { number, submitted, begun: Instant::now() };
                 let mut rate = rate.lock().unwrap_or_else(PoisonError::into_inner);
                 let features = rate.encode(features, &codec, &confidence, capture_nanos, Some(&turn))?;
                 if let Some(choice) = features.rate {
-                    books.adapted(&topic, choice.reason);
+                    stats.adapted(&topic, choice.reason);
                 }
                 wire::encode(stamp, Bev { pose, features })
             });
         }
         if let Some(boxes) = &self.boxes {
-            boxes.offer(input.capture_nanos, Boxes { pose, detections });
+            boxes.submit(input.capture_nanos, Boxes { pose, detections });
         }
         if let (Some(points), Some(shared)) = (&self.points, shared) {
-            points.offer(input.capture_nanos, Points { pose, points: shared });
+            points.submit(input.capture_nanos, Points { pose, points: shared });
         }
     }
 

@@ -49,7 +49,7 @@ pub struct Turn {
     /// Number of maps submitted before it. Those between the last turn and this one were superseded.
     pub number: u64,
     /// Time of submission.
-    pub offered: Instant,
+    pub submitted: Instant,
     /// Time at which the messages before it had left.
     pub begun: Instant,
 }
@@ -146,10 +146,10 @@ impl QueueWatch {
     fn allow(&mut self, turn: &Turn, smallest: u64, largest: u64) -> u64 {
         let floor = (largest as f64 * SMALLEST_SHARE).max(2.0 * smallest as f64);
         if let Some(last) = self.last.replace(*turn) {
-            let offers = turn.number.saturating_sub(last.number).max(1);
-            let period = turn.offered.saturating_duration_since(last.offered).div_f64(offers as f64);
-            let waited = turn.begun.saturating_duration_since(turn.offered);
-            self.allowed = if offers > 1 || waited > period.mul_f64(BLOCKED_SHARE) {
+            let submissions = turn.number.saturating_sub(last.number).max(1);
+            let period = turn.submitted.saturating_duration_since(last.submitted).div_f64(submissions as f64);
+            let waited = turn.begun.saturating_duration_since(turn.submitted);
+            self.allowed = if submissions > 1 || waited > period.mul_f64(BLOCKED_SHARE) {
                 let took = turn.begun.saturating_duration_since(last.begun);
                 Some(self.backed_off(period, took).max(floor))
             } else {
@@ -208,13 +208,13 @@ mod tests {
         fn drive(&mut self, frames: u64, bytes_per_second: f64) -> (Vec<(u64, Duration)>, u64) {
             let (mut sent, mut superseded) = (Vec::new(), 0);
             for _ in 0..frames {
-                let offered = self.start + Duration::from_millis(100 * self.number);
-                if self.free <= offered {
+                let submitted = self.start + Duration::from_millis(100 * self.number);
+                if self.free <= submitted {
                     self.send(bytes_per_second, &mut sent);
                 }
-                superseded += u64::from(self.waiting.replace((self.number, offered)).is_some());
+                superseded += u64::from(self.waiting.replace((self.number, submitted)).is_some());
                 self.number += 1;
-                if self.free <= offered {
+                if self.free <= submitted {
                     self.send(bytes_per_second, &mut sent);
                 }
             }
@@ -222,12 +222,12 @@ mod tests {
         }
 
         fn send(&mut self, bytes_per_second: f64, sent: &mut Vec<(u64, Duration)>) {
-            let Some((number, offered)) = self.waiting.take() else { return };
-            let begun = self.free.max(offered);
-            let turn = Turn { number, offered, begun };
+            let Some((number, submitted)) = self.waiting.take() else { return };
+            let begun = self.free.max(submitted);
+            let turn = Turn { number, submitted, begun };
             let bytes = HEAD_BYTES + encode(&mut self.control, 100_000_000 * number, Some(&turn)).body.len() as u64;
             self.free = begun + Duration::from_secs_f64(bytes as f64 / bytes_per_second);
-            sent.push((bytes, begun - offered));
+            sent.push((bytes, begun - submitted));
         }
     }
 

@@ -23,16 +23,16 @@ pub struct PairedSweep<S> {
 /// Holds the newest sweep until its pose arrives, or is known to be lost.
 #[derive(Debug)]
 pub struct SweepPairing<S> {
-    patience: Duration,
+    timeout: Duration,
     waiting: Option<(u64, S, Instant)>,
     poses: BTreeMap<u64, Pose>,
 }
 
 impl<S> SweepPairing<S> {
-    /// Pairing with at most `patience` of waiting for the pose of a sweep.
+    /// Pairing with at most `timeout` of waiting for the pose of a sweep.
     #[must_use]
-    pub fn new(patience: Duration) -> Self {
-        Self { patience, waiting: None, poses: BTreeMap::new() }
+    pub fn new(timeout: Duration) -> Self {
+        Self { timeout, waiting: None, poses: BTreeMap::new() }
     }
 
     /// Adds a pose. Returns how many others were dropped: the oldest if there are too many, and those of later sweeps.
@@ -66,7 +66,7 @@ impl<S> SweepPairing<S> {
         let pose = self.poses.get(&capture_nanos).copied();
         // Poses arrive in order: a later one shows that this sweep's own is lost.
         let is_lost = self.poses.range((Bound::Excluded(capture_nanos), Bound::Unbounded)).next().is_some();
-        if pose.is_none() && !is_lost && now < since + self.patience {
+        if pose.is_none() && !is_lost && now < since + self.timeout {
             return None;
         }
         let later = self.take_later(capture_nanos);
@@ -79,7 +79,7 @@ impl<S> SweepPairing<S> {
     /// Time of the next call of [`Self::next`] if nothing arrives.
     #[must_use]
     pub fn deadline(&self) -> Option<Instant> {
-        self.waiting.as_ref().map(|(_, _, since)| *since + self.patience)
+        self.waiting.as_ref().map(|(_, _, since)| *since + self.timeout)
     }
 }
 
@@ -87,7 +87,7 @@ impl<S> SweepPairing<S> {
 mod tests {
     use super::*;
 
-    const PATIENCE: Duration = Duration::from_millis(200);
+    const TIMEOUT: Duration = Duration::from_millis(200);
 
     fn at(x_m: f64) -> Pose {
         Pose::from_xyz_yaw([x_m, 0.0, 0.0], 0.0)
@@ -100,7 +100,7 @@ mod tests {
 
     #[test]
     fn a_sweep_is_paired_with_its_pose_in_either_order() {
-        let (mut pairing, now) = (SweepPairing::new(PATIENCE), Instant::now());
+        let (mut pairing, now) = (SweepPairing::new(TIMEOUT), Instant::now());
         assert_eq!(pairing.add_pose(10, at(1.0)), 0);
         assert_eq!(pairing.add_sweep(10, 'a', now), None);
         assert_eq!(paired(&mut pairing, now), Some((10, 'a', Some(1.0), 0)));
@@ -112,19 +112,19 @@ mod tests {
 
     #[test]
     fn a_lost_pose_is_noticed_by_the_next_or_by_the_time() {
-        let (mut pairing, now) = (SweepPairing::new(PATIENCE), Instant::now());
+        let (mut pairing, now) = (SweepPairing::new(TIMEOUT), Instant::now());
         assert_eq!(pairing.add_sweep(10, 'a', now), None);
         assert_eq!(pairing.add_pose(20, at(2.0)), 0);
         assert_eq!(paired(&mut pairing, now), Some((10, 'a', None, 0)));
         assert_eq!(pairing.add_sweep(30, 'c', now), None);
         assert_eq!(paired(&mut pairing, now), None);
-        assert_eq!(pairing.deadline(), Some(now + PATIENCE));
-        assert_eq!(paired(&mut pairing, now + PATIENCE), Some((30, 'c', None, 1)), "the pose of 20 has no sweep");
+        assert_eq!(pairing.deadline(), Some(now + TIMEOUT));
+        assert_eq!(paired(&mut pairing, now + TIMEOUT), Some((30, 'c', None, 1)), "the pose of 20 has no sweep");
     }
 
     #[test]
     fn a_restarted_scene_is_not_mistaken_for_one_with_lost_poses() {
-        let (mut pairing, now) = (SweepPairing::new(PATIENCE), Instant::now());
+        let (mut pairing, now) = (SweepPairing::new(TIMEOUT), Instant::now());
         assert_eq!(pairing.add_pose(90, at(9.0)) + pairing.add_pose(100, at(10.0)), 0);
         assert_eq!(pairing.add_pose(10, at(1.0)), 2, "those of the old scene are dropped and counted");
         assert_eq!(pairing.add_sweep(20, 'b', now), None);
@@ -137,7 +137,7 @@ mod tests {
 
     #[test]
     fn the_largest_capture_time_has_no_later_poses() {
-        let (mut pairing, now) = (SweepPairing::new(PATIENCE), Instant::now());
+        let (mut pairing, now) = (SweepPairing::new(TIMEOUT), Instant::now());
         assert_eq!(pairing.add_pose(10, at(1.0)) + pairing.add_pose(u64::MAX, at(2.0)), 0);
         assert_eq!(pairing.add_sweep(u64::MAX, 'z', now), None);
         assert_eq!(paired(&mut pairing, now), Some((u64::MAX, 'z', Some(2.0), 1)));
@@ -147,7 +147,7 @@ mod tests {
 
     #[test]
     fn replaced_sweeps_are_returned() {
-        let (mut pairing, now) = (SweepPairing::new(PATIENCE), Instant::now());
+        let (mut pairing, now) = (SweepPairing::new(TIMEOUT), Instant::now());
         assert_eq!(pairing.add_sweep(10, 'a', now), None);
         assert_eq!(pairing.add_sweep(20, 'b', now), Some('a'));
         let gone: usize = (0..40).map(|k| pairing.add_pose(100 + k, at(0.0))).sum();

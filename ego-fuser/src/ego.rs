@@ -109,7 +109,7 @@ impl Ego {
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub fn with_trust(mut self, config: Option<MisbehaviourConfig>) -> Result<Self, EgoError> {
+    pub fn with_misbehaviour_detection(mut self, config: Option<MisbehaviourConfig>) -> Result<Self, EgoError> {
         self.trust = config.map(|config| MisbehaviourDetector::new(config, &mut self.detector)).transpose()?;
         Ok(self)
     }
@@ -160,7 +160,7 @@ impl Ego {
             let found = self.judge(&aligned)?;
             let is_out: Vec<bool> = found.iter().map(Assessment::is_out).collect();
             let left_out = fused.iter().zip(&is_out).filter(|(_, is_out)| **is_out);
-            skipped.extend(left_out.map(|(&index, _)| (index, Skipped::Unusable(DropReason::Distrusted))));
+            skipped.extend(left_out.map(|(&index, _)| (index, Skipped::Unusable(DropReason::Misbehaviour))));
             beliefs = fused.iter().copied().zip(found).collect();
             fused = keep(fused, &is_out);
             let mut others = keep(aligned.split_off(1), &is_out);

@@ -63,7 +63,7 @@ impl Principal {
     /// # Panics
     /// Never: the names of roles are identifiers.
     #[must_use]
-    pub fn alone(role: Role) -> Self {
+    pub fn of_role(role: Role) -> Self {
         Self { role, cav: CavId::new(role.as_str()).expect("the name of a role is an identifier") }
     }
 
@@ -178,7 +178,7 @@ impl FromStr for Principal {
         let role = Role::ALL.into_iter().find(|known| known.as_str() == role).ok_or_else(unknown)?;
         match cav {
             Some(cav) => Ok(Self { role, cav: CavId::new(cav)? }),
-            None => Ok(Self::alone(role)),
+            None => Ok(Self::of_role(role)),
         }
     }
 }

@@ -37,7 +37,7 @@ named! {
         /// Capture time is in the future.
         Future = "future",
         /// Sender was excluded by misbehaviour detection.
-        Distrusted = "distrusted",
+        Misbehaviour = "misbehaviour",
         /// Exceeds the rate limit of its sender.
         RateLimit = "rate_limit",
     }
@@ -48,6 +48,6 @@ impl DropReason {
     /// rejected.
     #[must_use]
     pub fn is_loss(self) -> bool {
-        !matches!(self, Self::LinkLoss | Self::LinkQueue | Self::OutOfRange | Self::Distrusted)
+        !matches!(self, Self::LinkLoss | Self::LinkQueue | Self::OutOfRange | Self::Misbehaviour)
     }
 }

@@ -32,7 +32,7 @@ use crate::text::excerpt;
 /// First chunk of every key.
 pub const KEY_ROOT: &str = "v2v";
 /// Chunk of a key that no process ever declares.
-pub(crate) const UNDECLARED: &str = "nobody";
+pub(crate) const UNDECLARED: &str = "undeclared";
 /// Maximum length of a key, bytes; longer texts are rejected.
 pub(crate) const MAX_KEY_BYTES: usize = 256;
 

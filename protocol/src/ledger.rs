@@ -231,7 +231,7 @@ impl Ledger {
     /// accounts have to balance by themselves.
     pub fn exempt(&mut self, is_exempt: impl Fn(&Account) -> bool) -> u64 {
         let mut exempted = 0;
-        for Discrepancy { topic, to, missing, .. } in self.balance().differences {
+        for Discrepancy { topic, to, missing, .. } in self.balance().discrepancies {
             let account = Account { topic, to };
             if !is_exempt(&account) {
                 continue;
@@ -312,14 +312,14 @@ mod tests {
         ledgers[0].sent(&Account::published(bev()));
         let balance = sum(&ledgers).balance();
         assert!(!balance.is_exact());
-        assert_eq!(balance.differences[0].missing, 1);
+        assert_eq!(balance.discrepancies[0].missing, 1);
         assert_eq!(
-            balance.differences[0].to_string(),
+            balance.discrepancies[0].to_string(),
             "4288/bev to ego-4279: 1 not accounted for (sent 12, received 6, dropped 4, in flight 1)"
         );
         ledgers[2].received(&Account::towards(bev(), &process("ego-4279")));
         ledgers[2].received(&Account::towards(bev(), &process("ego-4279")));
-        assert_eq!(sum(&ledgers).balance().differences[0].missing, -1);
+        assert_eq!(sum(&ledgers).balance().discrepancies[0].missing, -1);
     }
 
     #[test]
@@ -327,7 +327,7 @@ mod tests {
         let mut ledger = sum(&ledgers());
         let second = Account::towards(bev(), &process("ego-4288"));
         ledger.open(&second);
-        let difference = ledger.balance().differences.remove(0);
+        let difference = ledger.balance().discrepancies.remove(0);
         assert_eq!((difference.to, difference.missing), (second.to, 10));
     }
 
@@ -363,7 +363,7 @@ mod tests {
         ledger.sent(&Account::published(bev()));
         let balance = ledger.balance();
         assert!(balance.is_exact());
-        assert_eq!(balance.unheard, [UnreceivedTopic { topic: bev(), messages: 1 }]);
+        assert_eq!(balance.unreceived, [UnreceivedTopic { topic: bev(), messages: 1 }]);
     }
 
     #[test]
@@ -384,7 +384,7 @@ mod tests {
     fn hostile_numbers_saturate() {
         let line = r#"{"topic":"1/bev","to":"x","sent":18446744073709551615,"received":0,"in_flight":0,"dropped":{}}"#;
         let ledger: Ledger = serde_json::from_str(&format!("[{line},{line}]")).unwrap();
-        assert_eq!(ledger.balance().differences[0].missing, i64::MAX);
-        assert!(!ledger.balance().differences[0].to_string().is_empty());
+        assert_eq!(ledger.balance().discrepancies[0].missing, i64::MAX);
+        assert!(!ledger.balance().discrepancies[0].to_string().is_empty());
     }
 }

@@ -119,8 +119,8 @@ pub use key::{Key, KeyError, KeyExpr};
 pub use ledger::{Account, Counts, Ledger};
 pub use limits::Limits;
 pub use message::{
-    AgentTruth, Bev, Boxes, Control, Descriptor, Detections, DetectionsReport, FusedNeighbour, Gnss, GnssSource,
-    HeardNeighbour, Kind, Lidar, Message, ModelHash, NoPoseReason, Payload, Points, PoseEstimate, ProcessUsage, Radar,
+    AgentTruth, Bev, Boxes, Control, Descriptor, Detections, DetectionsReport, FusedNeighbour, Gnss, GnssSource, Kind,
+    Lidar, Message, ModelHash, NeighbourState, NoPoseReason, Payload, Points, PoseEstimate, ProcessUsage, Radar,
     SkippedNeighbour, StageSummary, StageTiming, Stats, TopicCount, TopicTraffic, TrueObject, Truth,
 };
 pub use misbehaviour_reason::MisbehaviourReason;

@@ -15,9 +15,9 @@ use crate::Topic;
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct Reconciliation {
     /// Accounts that do not balance.
-    pub differences: Vec<Discrepancy>,
+    pub discrepancies: Vec<Discrepancy>,
     /// Topics without any receiver; their messages are not lost.
-    pub unheard: Vec<UnreceivedTopic>,
+    pub unreceived: Vec<UnreceivedTopic>,
 }
 
 /// One account that does not balance.
@@ -47,7 +47,7 @@ impl Reconciliation {
     /// True if every message is accounted for.
     #[must_use]
     pub fn is_exact(&self) -> bool {
-        self.differences.is_empty()
+        self.discrepancies.is_empty()
     }
 
     pub(crate) fn of(ledger: &Ledger) -> Self {
@@ -65,7 +65,7 @@ impl Reconciliation {
             } else if !received.contains(&account.topic) {
                 match u64::try_from(counts.missing()) {
                     Ok(0) => {}
-                    Ok(messages) => balance.unheard.push(UnreceivedTopic { topic: account.topic.clone(), messages }),
+                    Ok(messages) => balance.unreceived.push(UnreceivedTopic { topic: account.topic.clone(), messages }),
                     Err(_) => balance.push_difference(account, counts),
                 }
             }
@@ -79,7 +79,7 @@ impl Reconciliation {
             let Account { topic, to } = account.clone();
             // Counters of real runs are far from the ends of the range; hostile ones may be clamped.
             let missing = missing.clamp(i64::MIN.into(), i64::MAX.into()) as i64;
-            self.differences.push(Discrepancy { topic, to, missing, counts });
+            self.discrepancies.push(Discrepancy { topic, to, missing, counts });
         }
     }
 }

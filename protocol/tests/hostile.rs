@@ -99,8 +99,8 @@ fn absurd_lengths_in_the_header_are_refused() {
     }
 }
 
-fn absurd_map(grid: BevGrid, channels: u32, selection: Selection, packing: Compression) -> WireError {
-    let codec = Codec { dtype: Dtype::I8, selection, packing };
+fn absurd_map(grid: BevGrid, channels: u32, selection: Selection, compression: Compression) -> WireError {
+    let codec = Codec { dtype: Dtype::I8, selection, compression };
     let features = EncodedFeatures { grid, channels, code_of: None, codec, rate: None, body: Body::Bytes(vec![0; 15]) };
     features.decode(&Limits::DEFAULT).unwrap_err()
 }
@@ -110,18 +110,24 @@ fn absurd_shapes_in_the_metadata_are_refused() {
     let (grid, none) = (sample::grid(), Selection::TopK { cells: 0 });
     let huge = BevGrid { width: u32::MAX, height: u32::MAX, ..grid };
     let large = BevGrid { width: 1024, height: 1024, ..grid };
-    for packing in [Compression::Raw, Compression::Zstd] {
-        assert!(matches!(absurd_map(huge, u32::MAX, Selection::Dense, packing), WireError::Limit { .. }));
-        assert!(matches!(absurd_map(huge, 1, none, packing), WireError::Limit { what: "grid cells", .. }));
-        assert!(matches!(absurd_map(grid, u32::MAX, none, packing), WireError::Limit { what: "channels", .. }));
+    for compression in [Compression::Raw, Compression::Zstd] {
+        assert!(matches!(absurd_map(huge, u32::MAX, Selection::Dense, compression), WireError::Limit { .. }));
+        assert!(matches!(absurd_map(huge, 1, none, compression), WireError::Limit { what: "grid cells", .. }));
+        assert!(matches!(absurd_map(grid, u32::MAX, none, compression), WireError::Limit { what: "channels", .. }));
         // 4 GiB decompressed, from an empty body.
-        assert!(matches!(absurd_map(large, 1024, none, packing), WireError::Limit { what: "feature map bytes", .. }));
+        assert!(matches!(
+            absurd_map(large, 1024, none, compression),
+            WireError::Limit { what: "feature map bytes", .. }
+        ));
         let all_and_one = Selection::TopK { cells: grid.cells() as u32 + 1 };
-        assert!(matches!(absurd_map(grid, 1, all_and_one, packing), WireError::Limit { what: "selected cells", .. }));
+        assert!(matches!(
+            absurd_map(grid, 1, all_and_one, compression),
+            WireError::Limit { what: "selected cells", .. }
+        ));
         let empty = BevGrid { height: 0, ..grid };
-        assert!(matches!(absurd_map(empty, 1, Selection::Dense, packing), WireError::Shape { .. }));
+        assert!(matches!(absurd_map(empty, 1, Selection::Dense, compression), WireError::Shape { .. }));
         for cell_m in [0.0, -1.0, f64::NAN, f64::INFINITY] {
-            let error = absurd_map(BevGrid { cell_m, ..grid }, 1, none, packing);
+            let error = absurd_map(BevGrid { cell_m, ..grid }, 1, none, compression);
             assert!(matches!(error, WireError::Value { what: "grid cell_m", .. }), "{error}");
         }
     }

@@ -43,7 +43,7 @@ fn fnv1a(bytes: &[u8]) -> u64 {
 }
 
 fn compressed(message: &Message) -> bool {
-    matches!(message, Message::Bev(bev) if bev.features.codec.packing == Compression::Zstd)
+    matches!(message, Message::Bev(bev) if bev.features.codec.compression == Compression::Zstd)
 }
 
 #[test]

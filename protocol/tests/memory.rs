@@ -20,9 +20,9 @@ fn resident(field: &str) -> u64 {
 }
 
 /// `[1024, 32, 64]`: 8 MiB as `f32`, the maximum of the limits.
-fn largest_map(dtype: Dtype, selection: Selection, packing: Compression, body: Vec<u8>) -> EncodedFeatures {
+fn largest_map(dtype: Dtype, selection: Selection, compression: Compression, body: Vec<u8>) -> EncodedFeatures {
     let grid = BevGrid { width: 64, height: 32, ..sample::grid() };
-    let codec = Codec { dtype, selection, packing };
+    let codec = Codec { dtype, selection, compression };
     EncodedFeatures { grid, channels: 1024, code_of: None, codec, rate: None, body: Body::Bytes(body) }
 }
 

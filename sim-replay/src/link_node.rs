@@ -54,7 +54,7 @@ impl NodeOptions {
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
 pub struct LinkReport {
     /// Messages from agents.
-    pub offered: u64,
+    pub submitted: u64,
     /// Of these, forwarded.
     pub arrived: u64,
     /// Forwarded a second time.
@@ -88,7 +88,7 @@ pub fn run(bus: &Bus, emulator: LinkEmulator, options: &NodeOptions, stop: &Stop
     let longest = kept.values().map(|arrival| arrival.at.elapsed()).max().unwrap_or_default();
     report.longest_ms = u64::try_from(longest.as_millis()).unwrap_or(u64::MAX);
     for topic in kept.values().map(|arrival| &arrival.topic) {
-        bus.books().dropped(topic, DropReason::Stale);
+        bus.stats().dropped(topic, DropReason::Stale);
     }
     vehicles.into_values().flat_map(|vehicle| vehicle.publishers.into_values()).for_each(Publisher::finish);
     presence.withdraw()?;
@@ -249,7 +249,7 @@ impl<'a> Node<'a> {
     /// Records the position of a vehicle: loss may depend on distance.
     fn locate(&mut self, cav: &CavId, arrival: &Arrival) {
         let Some(Gnss { world_from_lidar, .. }) = self.inbox.decode(arrival, &Limits::DEFAULT) else { return };
-        self.bus.books().received(&arrival.topic);
+        self.bus.stats().received(&arrival.topic);
         if let Some(vehicle) = self.vehicles.get_mut(cav) {
             vehicle.position_m = Some(world_from_lidar.translation_m);
         }
@@ -258,7 +258,7 @@ impl<'a> Node<'a> {
     fn admit(&mut self, from: CavId, stream: Stream, arrival: Arrival) {
         let began = *self.began.get_or_insert(arrival.at);
         let distance_m = self.distance_m(&from);
-        self.report.offered += 1;
+        self.report.submitted += 1;
         match self.vehicles.get_mut(&from) {
             // The end was that of the previous process instance; it can arrive after the first message of the new one.
             Some(vehicle) => {
@@ -271,14 +271,14 @@ impl<'a> Node<'a> {
             return self.lose(&arrival, DropReason::LinkQueue);
         }
         self.kept_bytes += arrival.wire_bytes();
-        self.emulator.offer(Packet {
+        self.emulator.submit(Packet {
             id: self.next_id,
             from,
             to: self.options.ego.clone(),
             stream,
             sequence: arrival.header.stamp.sequence,
             bytes: arrival.wire_bytes(),
-            offered_nanos: nanos::between(began, arrival.at),
+            submitted_nanos: nanos::between(began, arrival.at),
             distance_m,
         });
         self.kept.insert(self.next_id, arrival);
@@ -297,9 +297,7 @@ impl<'a> Node<'a> {
     /// Forwards the messages that have arrived by now.
     fn settle(&mut self) {
         let Some(began) = self.began else { return };
-        for Outcome { parcel: packet, fate: delivery, .. } in
-            self.emulator.advance(nanos::between(began, Instant::now()))
-        {
+        for Outcome { packet, delivery, .. } in self.emulator.advance(nanos::between(began, Instant::now())) {
             match delivery {
                 Delivery::Dropped(reason) => {
                     if let Some(lost) = self.release(packet.id) {
@@ -326,7 +324,7 @@ impl<'a> Node<'a> {
             self.report.copies += 1;
         } else {
             self.report.arrived += 1;
-            self.bus.books().received(&arrival.topic);
+            self.bus.stats().received(&arrival.topic);
         }
         if !is_repeated {
             self.release(packet.id);
@@ -336,7 +334,7 @@ impl<'a> Node<'a> {
     /// Counts a message that is not forwarded.
     fn lose(&mut self, arrival: &Arrival, reason: DropReason) {
         *self.report.dropped.entry(reason).or_default() += 1;
-        self.bus.books().dropped(&arrival.topic, reason);
+        self.bus.stats().dropped(&arrival.topic, reason);
     }
 
     /// Removes a kept message.

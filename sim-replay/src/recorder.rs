@@ -156,11 +156,11 @@ impl Recorder<'_> {
         let mut flush_at = Instant::now() + FLUSH_PERIOD;
         loop {
             match tap.take(Some(flush_at)) {
-                Pop::Item(topic, overheard) => {
+                Pop::Item(topic, raw) => {
                     if topic == Topic::Control(Verb::End) {
                         self.over = Some(Instant::now());
                     }
-                    self.take(&overheard);
+                    self.take(&raw);
                 }
                 Pop::TimedOut => {}
                 Pop::Closed => return,
@@ -176,8 +176,8 @@ impl Recorder<'_> {
         }
     }
 
-    fn take(&mut self, overheard: &RawMessage) {
-        let Key { run, topic } = &overheard.key;
+    fn take(&mut self, raw: &RawMessage) {
+        let Key { run, topic } = &raw.key;
         let stream = match topic {
             Topic::Stream { stream, .. } | Topic::Received { stream, .. } => Some(stream),
             _ => None,
@@ -186,8 +186,8 @@ impl Recorder<'_> {
             return;
         }
         self.taken += 1;
-        self.span = Some((self.span.map_or(overheard.arrived_nanos, |(first, _)| first), overheard.arrived_nanos));
-        self.attempt(|writer| writer.write(&overheard.key, overheard.arrived_nanos, &overheard.bytes()));
+        self.span = Some((self.span.map_or(raw.arrived_nanos, |(first, _)| first), raw.arrived_nanos));
+        self.attempt(|writer| writer.write(&raw.key, raw.arrived_nanos, &raw.bytes()));
     }
 
     fn attempt(&mut self, write: impl FnOnce(&mut RecordingWriter<std::fs::File>) -> Result<(), RecordingError>) {

@@ -63,7 +63,7 @@ fn under_faults(seed: u64, count: usize) -> Vec<String> {
     let faults = plan(seed, count);
     let report = FaultyFleet::start(folder.path())
         .suffer(&faults, |number, fault, ms| eprintln!("{number}: {fault}, as before after {ms} ms"));
-    let Report { findings, slowest, balances, differences, exempted, stop, left_over, growth, restarts } = report;
+    let Report { findings, slowest, balances, discrepancies, exempted, stop, left_over, growth, restarts } = report;
     let returns = findings.fused_again_ms.len();
     let ms: Vec<f64> = findings.fused_again_ms.iter().map(|&ms| ms as f64).collect();
     let ms = statistics::sorted(&ms);
@@ -76,7 +76,7 @@ fn under_faults(seed: u64, count: usize) -> Vec<String> {
         quantile(0.5),
         quantile(0.95)
     );
-    println!("{exempted} messages exempt, as a process that they concern was offline; {differences}");
+    println!("{exempted} messages exempt, as a process that they concern was offline; {discrepancies}");
     let [descriptors, threads] = growth;
     missed(&[
         (

@@ -7,7 +7,7 @@
 //! ```text
 //! cargo build --release --workspace --bins
 //! cargo bench -p tests --bench scaling -- --out deploy/results/scaling
-//! cargo bench -p tests --bench scaling -- --out /tmp/scaling --lattices small --dtype f16 --agents 1,8 --seconds 10
+//! cargo bench -p tests --bench scaling -- --out /tmp/scaling --models small --dtype f16 --agents 1,8 --seconds 10
 //! ```
 //!
 //! Lattices (BEV grids): `lean`, that of the released weights (64 channels on 128 x 96 cells), and `small`, a quarter
@@ -39,7 +39,7 @@ use protocol::{
     Topic, encode_features, wire,
 };
 use support::statistics;
-use tests::bus::{PATIENCE, TestRouter};
+use tests::bus::{TIMEOUT, TestRouter};
 use tests::machine;
 
 const PERIOD: Duration = Duration::from_millis(100);
@@ -55,7 +55,7 @@ const IN_TIME: f64 = 0.95;
 /// Options of the benchmark.
 struct Wanted {
     out: PathBuf,
-    lattices: Vec<String>,
+    models: Vec<String>,
     dtype: Dtype,
     agents: Vec<usize>,
     seconds: u32,
@@ -64,7 +64,7 @@ struct Wanted {
 fn wanted(arguments: &[String]) -> Result<Wanted> {
     let mut wanted = Wanted {
         out: PathBuf::new(),
-        lattices: vec!["lean".into(), "small".into()],
+        models: vec!["lean".into(), "small".into()],
         dtype: Dtype::I8,
         agents: vec![1, 2, 4, 8, 16, 32],
         seconds: 20,
@@ -75,7 +75,7 @@ fn wanted(arguments: &[String]) -> Result<Wanted> {
         match name.as_str() {
             // cargo runs benches in the folder of their package.
             "--out" => wanted.out = Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join(value),
-            "--lattices" => wanted.lattices = value.split(',').map(str::to_owned).collect(),
+            "--models" => wanted.models = value.split(',').map(str::to_owned).collect(),
             "--dtype" => {
                 wanted.dtype = match value.as_str() {
                     "f16" => Dtype::F16,
@@ -85,7 +85,7 @@ fn wanted(arguments: &[String]) -> Result<Wanted> {
             }
             "--agents" => wanted.agents = value.split(',').map(str::parse).collect::<Result<_, _>>()?,
             "--seconds" => wanted.seconds = value.parse()?,
-            _ => bail!("{name} is none of --out, --lattices, --dtype, --agents, --seconds"),
+            _ => bail!("{name} is none of --out, --models, --dtype, --agents, --seconds"),
         }
     }
     if wanted.out == PathBuf::new() {
@@ -96,7 +96,7 @@ fn wanted(arguments: &[String]) -> Result<Wanted> {
 
 /// One line of the table; times in milliseconds.
 struct Row {
-    lattice: String,
+    model: String,
     dtype: Dtype,
     bytes: u64,
     neighbours: usize,
@@ -118,8 +118,8 @@ struct ReceivedResult {
 }
 
 /// The feature map of a recorded sweep, and weights of the BEV grid.
-fn recorded_map(lattice: &str, folder: &Path, dtype: Dtype) -> Result<(PathBuf, EncodedFeatures)> {
-    let file = match lattice {
+fn recorded_map(model: &str, folder: &Path, dtype: Dtype) -> Result<(PathBuf, EncodedFeatures)> {
+    let file = match model {
         "lean" => Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy/weights/lean-max.safetensors"),
         "small" => {
             let config =
@@ -130,7 +130,7 @@ fn recorded_map(lattice: &str, folder: &Path, dtype: Dtype) -> Result<(PathBuf, 
             weights::save(&file, &model.variables, &model.about(), weights::Precision::Single)?;
             file
         }
-        _ => bail!("lattice must be lean or small"),
+        _ => bail!("model must be lean or small"),
     };
     tests::scene::write(folder, &["0"], 1);
     let scenario = dataset::open(&folder.join("scene"))?.scenarios.remove(0);
@@ -184,7 +184,7 @@ fn measure(file: &Path, map: &EncodedFeatures, count: usize, seconds: u32) -> Re
     for index in 0..=count {
         routes.push(Route { topic: topic(index, Stream::Bev), receiver: "ego-0".parse()? });
     }
-    Barrier::new(routes).await_routes(&scorer)?.wait(PATIENCE)?;
+    Barrier::new(routes).await_routes(&scorer)?.wait(TIMEOUT)?;
 
     let (began, mut cpu_ms, mut first_nanos) = (Instant::now(), 0.0, 0);
     let ticks = WARM_UP + seconds * 10;
@@ -196,7 +196,7 @@ fn measure(file: &Path, map: &EncodedFeatures, count: usize, seconds: u32) -> Re
         }
         for (index, publisher) in publishers.iter().enumerate() {
             let (features, pose) = (map.clone(), pose(index, count));
-            publisher.offer_encoded(capture_nanos, move |stamp| wire::encode(stamp, Bev { pose, features }));
+            publisher.submit_encoded(capture_nanos, move |stamp| wire::encode(stamp, Bev { pose, features }));
         }
     }
     thread::sleep(PERIOD * 3);
@@ -234,7 +234,7 @@ fn row(map: &EncodedFeatures, count: usize, ticks: usize, cpu_ms: f64, received:
     let quantile = |q: f64| statistics::quantile(&latencies, q).unwrap_or(f64::NAN);
     let fused: usize = received.iter().map(|received| received.in_time).sum();
     Row {
-        lattice: String::new(),
+        model: String::new(),
         dtype: Dtype::F32,
         bytes: map.body.as_bytes().len() as u64,
         neighbours: count,
@@ -266,37 +266,37 @@ fn line(rows: &[&Row]) -> Option<[f64; 3]> {
 
 fn write(wanted: &Wanted, arguments: &str, rows: &[Row]) -> Result<()> {
     fs::create_dir_all(&wanted.out)?;
-    let mut csv = "lattice,dtype,map_bytes,neighbours,frames,lost_frames,incomplete_frames,share_in_time,\
+    let mut csv = "model,dtype,map_bytes,neighbours,frames,lost_frames,incomplete_frames,share_in_time,\
         ego_cpu_ms_per_frame,latency_p50_ms,latency_p99_ms\n"
         .to_owned();
     let mut markdown = format!(
         "`cargo bench -p tests --bench scaling -- {arguments}`\n\n{}\n\n\
-        | lattice | dtype | KB a map | neighbours | frames | lost frames | incomplete | maps in time | ego CPU ms/frame | \
+        | model | dtype | KB a map | neighbours | frames | lost frames | incomplete | maps in time | ego CPU ms/frame | \
         latency p50 ms | p99 ms |\n|---|---|---|---|---|---|---|---|---|---|---|\n",
         machine::describe(),
     );
     for row in rows {
-        let Row { lattice, dtype, bytes, neighbours, frames, lost_frames, incomplete, in_time, .. } = row;
+        let Row { model, dtype, bytes, neighbours, frames, lost_frames, incomplete, in_time, .. } = row;
         let [cpu, p50, p99] = [row.cpu_per_frame_ms, row.latency_p50_ms, row.latency_p99_ms];
         let dtype = format!("{dtype:?}").to_lowercase();
         writeln!(
             csv,
-            "{lattice},{dtype},{bytes},{neighbours},{frames},{lost_frames},{incomplete},{in_time:.4},{cpu:.2},{p50:.1},{p99:.1}"
+            "{model},{dtype},{bytes},{neighbours},{frames},{lost_frames},{incomplete},{in_time:.4},{cpu:.2},{p50:.1},{p99:.1}"
         )?;
         writeln!(
             markdown,
-            "| {lattice} | {dtype} | {} | {neighbours} | {frames} | {lost_frames} | {incomplete} | {:.1} % | {cpu:.1} | {p50:.1} | {p99:.1} |",
+            "| {model} | {dtype} | {} | {neighbours} | {frames} | {lost_frames} | {incomplete} | {:.1} % | {cpu:.1} | {p50:.1} | {p99:.1} |",
             bytes / 1000,
             100.0 * in_time
         )?;
     }
     markdown.push('\n');
-    for lattice in &wanted.lattices {
-        let rows: Vec<&Row> = rows.iter().filter(|row| row.lattice == *lattice).collect();
+    for model in &wanted.models {
+        let rows: Vec<&Row> = rows.iter().filter(|row| row.model == *model).collect();
         if let Some([offset, slope, share]) = line(&rows) {
             writeln!(
                 markdown,
-                "{lattice}: {offset:.1} ms and {slope:.2} ms for each neighbour, R^2 {share:.4}, over the counts with at \
+                "{model}: {offset:.1} ms and {slope:.2} ms for each neighbour, R^2 {share:.4}, over the counts with at \
                  least 95 % of the maps in time"
             )?;
         }
@@ -312,18 +312,18 @@ fn main() -> Result<()> {
     let wanted = wanted(&arguments)?;
     tch::set_num_threads(1);
     let mut rows = Vec::new();
-    for lattice in &wanted.lattices {
+    for model in &wanted.models {
         let folder = tempfile::tempdir()?;
-        let (file, map) = recorded_map(lattice, folder.path(), wanted.dtype)?;
+        let (file, map) = recorded_map(model, folder.path(), wanted.dtype)?;
         for &count in &wanted.agents {
             let (row, _) = measure(&file, &map, count, wanted.seconds)?;
             eprintln!(
-                "{lattice}, {count}: {:.1} ms CPU a frame, {:.1} % in time, p99 {:.1} ms",
+                "{model}, {count}: {:.1} ms CPU a frame, {:.1} % in time, p99 {:.1} ms",
                 row.cpu_per_frame_ms,
                 100.0 * row.in_time,
                 row.latency_p99_ms
             );
-            rows.push(Row { lattice: lattice.clone(), dtype: wanted.dtype, ..row });
+            rows.push(Row { model: model.clone(), dtype: wanted.dtype, ..row });
         }
     }
     write(&wanted, &arguments.join(" "), &rows)

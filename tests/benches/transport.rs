@@ -20,7 +20,7 @@ use bus::{Barrier, Bus, Event, Inbox, Publisher, PublisherOptions, Route, Subscr
 use protocol::message::Bev;
 use protocol::{BevFeatures, BevGrid, Body, CodecConfig, Limits, Pose, PoseEstimate, Topic, encode_features};
 use support::statistics;
-use tests::bus::{PATIENCE, TestRouter, free_port, next_event, wait_for};
+use tests::bus::{TIMEOUT, TestRouter, free_port, next_event, wait_for};
 use zenoh::bytes::ZBytes;
 use zenoh::qos::CongestionControl;
 use zenoh::{Config, Session, Wait};
@@ -52,7 +52,7 @@ impl Messages {
         let inbox = ego.inbox(4, 1);
         let subscription = ego.subscribe(topic.clone(), &inbox).expect("a subscription");
         let route = Route { topic, receiver: ego.identity().process.clone() };
-        Barrier::new([route]).await_routes(agent).expect("a bus").wait(PATIENCE).expect("a route");
+        Barrier::new([route]).await_routes(agent).expect("a bus").wait(TIMEOUT).expect("a route");
         Self { publisher, inbox, _subscription: subscription }
     }
 
@@ -61,7 +61,7 @@ impl Messages {
         let sent = map.clone();
         let pose = PoseEstimate::new(Pose::IDENTITY, 1.0);
         let began = Instant::now();
-        self.publisher.offer_encoded(round as u64, move |stamp| {
+        self.publisher.submit_encoded(round as u64, move |stamp| {
             let features = encode_features(sent, &CodecConfig::default(), None)?;
             protocol::wire::encode(stamp, Bev { pose, features })
         });
@@ -101,7 +101,7 @@ impl Bare {
         let expected = bytes.len();
         let began = Instant::now();
         self.publisher.put(bytes).wait().expect("a session");
-        let (seen, length) = self.arrivals.recv_timeout(PATIENCE).expect("the raw message");
+        let (seen, length) = self.arrivals.recv_timeout(TIMEOUT).expect("the raw message");
         assert_eq!(length, expected);
         seen - began
     }

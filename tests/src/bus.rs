@@ -8,7 +8,7 @@ use protocol::{CavId, ProcessId, RunId, Topic};
 use zenoh::Session;
 
 /// Longer than any step of a test takes, on a machine however busy.
-pub const PATIENCE: Duration = Duration::from_secs(60);
+pub const TIMEOUT: Duration = Duration::from_secs(60);
 
 /// Router for the clients of one test.
 pub struct TestRouter {
@@ -28,7 +28,7 @@ impl TestRouter {
         let opened = (0..20).find_map(|_| {
             let endpoint = Endpoint::loopback(free_port());
             // A pause of the whole machine must not count as a stalled receiver.
-            let options = BusOptions { stall_limit: PATIENCE, ..BusOptions::router(endpoint.clone()) };
+            let options = BusOptions { stall_limit: TIMEOUT, ..BusOptions::router(endpoint.clone()) };
             bus::open(&options).ok().map(|session| (endpoint, session))
         });
         let (endpoint, session) = opened.expect("a free port on loopback");
@@ -66,9 +66,9 @@ pub fn free_port() -> u16 {
 /// When none comes.
 #[must_use]
 pub fn next_event(inbox: &Inbox) -> (Topic, Event) {
-    match inbox.take(Some(Instant::now() + PATIENCE)) {
+    match inbox.take(Some(Instant::now() + TIMEOUT)) {
         Pop::Item(topic, event) => (topic, event),
-        Pop::TimedOut => panic!("nothing came within {PATIENCE:?}"),
+        Pop::TimedOut => panic!("nothing came within {TIMEOUT:?}"),
         Pop::Closed => panic!("the inbox is closed"),
     }
 }
@@ -78,9 +78,9 @@ pub fn next_event(inbox: &Inbox) -> (Topic, Event) {
 /// # Panics
 /// When it does not hold in time.
 pub fn wait_for(what: &str, mut condition: impl FnMut() -> bool) {
-    let deadline = Instant::now() + PATIENCE;
+    let deadline = Instant::now() + TIMEOUT;
     while !condition() {
-        assert!(Instant::now() < deadline, "{what}: not within {PATIENCE:?}");
+        assert!(Instant::now() < deadline, "{what}: not within {TIMEOUT:?}");
         std::thread::sleep(Duration::from_millis(2));
     }
 }

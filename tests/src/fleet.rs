@@ -18,7 +18,7 @@ use serde_json::Value;
 use crate::locks::random_generator_lock;
 
 /// Longer than any step of a test takes, under any load.
-pub const PATIENCE: Duration = Duration::from_secs(120);
+pub const TIMEOUT: Duration = Duration::from_secs(120);
 
 /// The folder of the profile that this test was built with, where cargo puts programs.
 ///
@@ -155,7 +155,7 @@ impl Up {
     /// # Panics
     /// When it does not come in time.
     pub fn wait_for_line(&mut self, text: &str) -> String {
-        let deadline = Instant::now() + PATIENCE;
+        let deadline = Instant::now() + TIMEOUT;
         loop {
             let left = deadline.saturating_duration_since(Instant::now());
             let line =
@@ -172,7 +172,7 @@ impl Up {
     /// # Panics
     /// When it does not hold in time.
     pub fn wait_for_results(&mut self, what: &str, condition: impl Fn(&[Value]) -> bool) {
-        let deadline = Instant::now() + PATIENCE;
+        let deadline = Instant::now() + TIMEOUT;
         loop {
             let results = results(&self.folder);
             if condition(&results) {
@@ -206,7 +206,7 @@ impl Up {
     /// # Panics
     /// When it does not end in time.
     pub fn wait(&mut self) -> ExitStatus {
-        let deadline = Instant::now() + PATIENCE;
+        let deadline = Instant::now() + TIMEOUT;
         loop {
             if let Some(status) = self.child.try_wait().expect("a child") {
                 return status;

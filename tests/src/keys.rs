@@ -31,7 +31,7 @@ pub const TRIED_FOR: Duration = Duration::from_secs(2);
 ///
 /// # Panics
 /// When zenoh rejects a setting.
-pub fn stranger(router: &Endpoint, authority: &Path, own: Option<&Path>) -> Result<Session, String> {
+pub fn unauthorised_peer(router: &Endpoint, authority: &Path, own: Option<&Path>) -> Result<Session, String> {
     let quoted = |path: &Path| format!("{:?}", path.to_str().unwrap());
     let mut settings = vec![
         ("mode", r#""client""#.to_owned()),
@@ -88,7 +88,7 @@ impl GuardedRouter {
     pub fn options(&self, holder: &str) -> BusOptions {
         let credentials = Credentials::read(&self.keys.join(holder)).expect("keys");
         let mut options = BusOptions::client(self.endpoint.clone()).with_credentials(credentials);
-        options.patience = Duration::from_secs(20);
+        options.timeout = Duration::from_secs(20);
         options
     }
 

@@ -38,7 +38,7 @@ pub fn write(folder: &Path, seed: i64) -> (PathBuf, PathBuf) {
     let encoder_sha256 =
         save(&encoder, &network, &metadata(SceneEncoder::KIND, &config), Precision::Single).expect("a writable folder");
     let config = SceneHeadConfig {
-        town: "nowhere".into(),
+        scene_name: "nowhere".into(),
         encoder_sha256,
         cell_channels: config.cell_channels(),
         sweep_channels: config.sweep_channels(),
@@ -63,7 +63,7 @@ pub fn write(folder: &Path, seed: i64) -> (PathBuf, PathBuf) {
 pub fn write_end_to_end(folder: &Path, regresses: EndToEndKind, seed: i64) -> PathBuf {
     let _generator = random_generator_lock();
     tch::manual_seed(seed);
-    let config = EndToEndConfig { regresses, town: "nowhere".into(), origin_m: [0.0; 3], encoder: tiny() };
+    let config = EndToEndConfig { regresses, scene_name: "nowhere".into(), origin_m: [0.0; 3], encoder: tiny() };
     let network = VarStore::new(Device::Cpu);
     EndToEnd::new(&network.root(), &config).expect("a configuration that fits");
     let path = folder.join(format!("{regresses:?}.safetensors"));

@@ -55,7 +55,7 @@ fn bench(criterion: &mut Criterion) {
 
 fn head_config(encoder: &SceneEncoderConfig) -> SceneHeadConfig {
     SceneHeadConfig {
-        town: "bench".into(),
+        scene_name: "bench".into(),
         encoder_sha256: String::new(),
         cell_channels: encoder.cell_channels(),
         sweep_channels: encoder.sweep_channels(),

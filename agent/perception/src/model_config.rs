@@ -422,9 +422,9 @@ mod tests {
         let grid = lean.feature_grid();
         assert_eq!((lean.feature_channels(), grid.height, grid.width, grid.cell_m), (64, 96, 128, 0.8));
         assert_eq!((lean.pillar_grid(), lean.sent_channels()), ([256, 192, 1], 64));
-        let squeezed = |ratio| DetectorConfig { compress_ratio: Some(ratio), ..DetectorConfig::lean() };
-        assert_eq!([1, 32, 100].map(|ratio| squeezed(ratio).sent_channels()), [64, 2, 1]);
-        assert_eq!(squeezed(32).feature_channels(), 64, "the receiver has the full number of channels");
+        let compressed = |ratio| DetectorConfig { compress_ratio: Some(ratio), ..DetectorConfig::lean() };
+        assert_eq!([1, 32, 100].map(|ratio| compressed(ratio).sent_channels()), [64, 2, 1]);
+        assert_eq!(compressed(32).feature_channels(), 64, "the receiver has the full number of channels");
     }
 
     #[test]

@@ -55,8 +55,8 @@ fn agent(config: &AgentConfig) -> anyhow::Result<Agent> {
 }
 
 fn output_filter(config: &AgentConfig) -> Box<dyn OutputFilter> {
-    match config.settings.lie {
-        Some(lie) => Box::new(Attack::new(lie, &config.cav, 0)),
+    match config.settings.falsification {
+        Some(falsification) => Box::new(Attack::new(falsification, &config.cav, 0)),
         None => Box::new(Unfiltered),
     }
 }

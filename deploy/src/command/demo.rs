@@ -6,7 +6,7 @@ use std::time::Instant;
 use anyhow::Context;
 use deploy::experiment::report;
 use deploy::operate::run_folder::name_of_now;
-use deploy::run::run_fleet::{RunResult, UpOptions, up};
+use deploy::run::run_fleet::{RunOptions, RunResult, run_scenario};
 use deploy::scenario::Scenario;
 use fusion::Method;
 use protocol::RunId;
@@ -69,8 +69,8 @@ impl Arguments {
             scenario.method = method;
             scenario.run = Some(RunId::new(&format!("{name}-{method}")).map_err(BadInput::of)?);
             scenario.check(&self.scenario)?;
-            let options = UpOptions { runs: self.runs.clone(), programs: programs()?, prefix: "demo" };
-            let result = up(&scenario, &options).with_context(|| format!("method {method}"))?;
+            let options = RunOptions { runs: self.runs.clone(), programs: programs()?, prefix: "demo" };
+            let result = run_scenario(&scenario, &options).with_context(|| format!("method {method}"))?;
             if !self.json {
                 output::line(report::run_report(&result))?;
             }
@@ -137,7 +137,7 @@ fn generate(options: &SynthOptions) -> anyhow::Result<()> {
     bar.finish_and_clear();
     match generated {
         Ok(_) => Ok(()),
-        Err(error @ (SynthError::Write { .. } | SynthError::Alone { .. })) => Err(error.into()),
+        Err(error @ (SynthError::Write { .. } | SynthError::TooFewCompanions { .. })) => Err(error.into()),
         Err(error) => Err(BadInput::of(error).into()),
     }
 }

@@ -77,7 +77,7 @@ pub(crate) struct Arguments {
     attack: Option<Falsification>,
     /// Number of attackers, the first neighbours of every scenario (--attack).
     #[arg(long, default_value_t = 1, requires = "attack")]
-    liars: usize,
+    attackers: usize,
     /// Seed of the falsified messages (--attack).
     #[arg(long, default_value_t = 0, requires = "attack")]
     attack_seed: u64,
@@ -154,7 +154,11 @@ impl Arguments {
             codec,
             rate: self.rate.0,
             delay_nanos: self.delay * 1_000_000,
-            attack: self.attack.map(|lie| AttackConfig { lie, liars: self.liars, seed: self.attack_seed }),
+            attack: self.attack.map(|falsification| AttackConfig {
+                falsification,
+                attackers: self.attackers,
+                seed: self.attack_seed,
+            }),
             trust: self.trust.then(MisbehaviourConfig::default),
             maps: self.maps.as_ref().map(|folder| KeptMaps {
                 folder: folder.clone(),

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use deploy::experiment::report;
-use deploy::run::run_fleet::{UpOptions, up};
+use deploy::run::run_fleet::{RunOptions, run_scenario};
 use deploy::scenario::Scenario;
 use fusion::Method;
 use protocol::RunId;
@@ -62,7 +62,7 @@ impl Arguments {
         }
         scenario.network.metrics = self.metrics.or(scenario.network.metrics);
         scenario.check(&self.scenario)?;
-        let result = up(&scenario, &UpOptions { runs: self.runs, programs: programs()?, prefix: "up" })?;
+        let result = run_scenario(&scenario, &RunOptions { runs: self.runs, programs: programs()?, prefix: "up" })?;
         if self.json {
             output::line(serde_json::to_string_pretty(&result.metrics)?)?;
         } else {

@@ -52,7 +52,7 @@ pub fn run_notes(result: &RunResult) -> String {
     let verdict = if result.balance.is_exact() {
         "every message is accounted for".into()
     } else {
-        format!("{} accounts do not add up, see ledger.json", result.balance.differences.len())
+        format!("{} accounts do not add up, see ledger.json", result.balance.discrepancies.len())
     };
     let _ = writeln!(text, "ledger    {verdict}");
     if result.missed > 0 {

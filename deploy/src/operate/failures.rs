@@ -21,10 +21,10 @@ impl Failures {
     pub(crate) fn note(&mut self, event: &ProcessEvent) -> Option<&str> {
         let ProcessEvent { name, what } = event;
         let text = match what {
-            ProcessEventKind::Said { line } if name == RECORDER => {
+            ProcessEventKind::Logged { line } if name == RECORDER => {
                 serde_json::from_str::<RecordReport>(line).ok()?.loss_in_words()?
             }
-            ProcessEventKind::Said { line } => {
+            ProcessEventKind::Logged { line } => {
                 self.last_line.insert(name.clone(), line.clone());
                 return None;
             }
@@ -38,7 +38,7 @@ impl Failures {
             ProcessEventKind::Failed { how } => format!("{how} when it was asked to end"),
             ProcessEventKind::GaveUp { is_optional: false, .. }
             | ProcessEventKind::Started { .. }
-            | ProcessEventKind::Fell { .. }
+            | ProcessEventKind::Crashed { .. }
             | ProcessEventKind::Done { data_lost: false } => return None,
         };
         self.failed.insert(name.clone(), text);
@@ -73,7 +73,7 @@ mod tests {
             not_written,
             failure: failure.map(str::to_owned),
         };
-        ProcessEventKind::Said { line: serde_json::to_string(&report).unwrap() }
+        ProcessEventKind::Logged { line: serde_json::to_string(&report).unwrap() }
     }
 
     #[test]
@@ -94,7 +94,7 @@ mod tests {
 
     #[test]
     fn every_process_counts() {
-        let last_line = |line: &str| ProcessEventKind::Said { line: line.into() };
+        let last_line = |line: &str| ProcessEventKind::Logged { line: line.into() };
         let events = [
             ("replay", last_line("7 ticks were not answered")),
             ("replay", ProcessEventKind::Done { data_lost: true }),

@@ -161,7 +161,7 @@ impl Fleet {
     pub fn parties(&self) -> Vec<Principal> {
         let agents = self.agents.iter().map(|cav| Principal::new(Role::Agent, cav));
         let egos = [Role::Ego, Role::Link].map(|role| Principal::new(role, &self.ego));
-        let others = [Role::Replay, Role::Scorer, Role::Recorder, Role::Viewer].map(Principal::alone);
+        let others = [Role::Replay, Role::Scorer, Role::Recorder, Role::Viewer].map(Principal::of_role);
         agents.chain(egos).chain(others).collect()
     }
 

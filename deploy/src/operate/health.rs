@@ -119,11 +119,11 @@ impl Health {
                     failure: noted.failure.take(),
                 };
             }
-            ProcessEventKind::Fell { how, restart, .. } => {
+            ProcessEventKind::Crashed { how, restart, .. } => {
                 (noted.state, noted.pid, noted.restarts) = (State::Fallen, None, *restart);
                 noted.last_fall = Some(how.clone());
             }
-            ProcessEventKind::Said { .. } => {}
+            ProcessEventKind::Logged { .. } => {}
             ProcessEventKind::GaveUp { how, .. } | ProcessEventKind::Failed { how } => {
                 (noted.state, noted.pid) = (State::Down, None);
                 noted.last_fall = Some(how.clone());
@@ -160,7 +160,7 @@ impl Health {
                 noted.started = noted.started.max(now.checked_sub(SILENT).unwrap_or(now));
                 noted.last_report = noted.last_report.map(|_| now);
             }
-            let (since, patience) = match noted.last_report {
+            let (since, timeout) = match noted.last_report {
                 Some(last_report) => (now.saturating_duration_since(last_report), self.hang),
                 None => (now.saturating_duration_since(noted.started), self.start),
             };
@@ -170,7 +170,7 @@ impl Health {
                 Some(_) if noted.failure.is_some() => State::Failing,
                 Some(_) => State::Ready,
             };
-            if since > patience && network_is_up {
+            if since > timeout && network_is_up {
                 hanging.push((name.clone(), format!("has not reported for {:.1} s", since.as_secs_f64())));
             }
         }
@@ -267,8 +267,10 @@ mod tests {
         assert_eq!(state(&health), State::Silent);
         let hanging = look(&mut health, began, [6000, 6100, 1000]);
         assert_eq!(hanging, [("ego".to_owned(), "has not reported for 5.1 s".to_owned())]);
-        health
-            .note(&event("ego", ProcessEventKind::Fell { how: "hung".into(), again_after: SILENT, restart: 1 }), began);
+        health.note(
+            &event("ego", ProcessEventKind::Crashed { how: "hung".into(), again_after: SILENT, restart: 1 }),
+            began,
+        );
         let status = health.statuses(began).remove(0);
         assert_eq!((status.state, status.restarts, status.last_fall.as_deref()), (State::Fallen, 1, Some("hung")));
     }

@@ -38,7 +38,7 @@ impl RouterEndpoint {
             Some(router) => {
                 let options = BusOptions::client(Endpoint::new(router)?);
                 keys.map_or(Ok(options.clone()), |keys| {
-                    keys.for_client(options, Principal::alone(Role::Scorer).name().as_str())
+                    keys.for_client(options, Principal::of_role(Role::Scorer).name().as_str())
                 })
             }
             None => {

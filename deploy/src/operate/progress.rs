@@ -46,7 +46,7 @@ impl Display {
     }
 
     /// Prints an event above the live line.
-    pub fn say(&self, text: &str) {
+    pub fn print_line(&self, text: &str) {
         match &self.bar {
             Some(bar) => bar.suspend(|| output::note(text)),
             None => output::note(text),

@@ -32,7 +32,7 @@ pub const RECORDING: &str = "recording.mcap";
 /// Arrival times of the sweeps at the ego's agent.
 pub const SWEEP_LOG: &str = "sweeps.csv";
 /// Checkpoint of the replay, from which a restarted one resumes.
-pub const BOOKMARK: &str = "replay.json";
+pub const CHECKPOINT: &str = "replay.json";
 
 /// The folder of one run.
 #[derive(Debug, Clone)]

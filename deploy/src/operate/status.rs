@@ -4,7 +4,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
-use protocol::HeardNeighbour;
+use protocol::NeighbourState;
 use serde::{Deserialize, Serialize};
 use support::atomic_file;
 use support::text_table::{Side, TextTable};
@@ -50,7 +50,7 @@ pub struct RunStatus {
     pub fused: usize,
     /// Neighbours whose messages the ego received for the last result, and its judgement of each.
     #[serde(default)]
-    pub neighbours: Vec<HeardNeighbour>,
+    pub neighbours: Vec<NeighbourState>,
     /// Number of messages dropped so far, by all processes.
     pub dropped: u64,
     /// Status of each process.
@@ -214,7 +214,7 @@ impl RunStatus {
                 neighbour.cav.to_string(),
                 optional(neighbour.clock_offset_s.map(|seconds| seconds * 1e3), 1),
                 optional(neighbour.trust, 2),
-                neighbour.doubt.map_or(String::new(), |doubt| doubt.to_string()),
+                neighbour.misbehaviour.map_or(String::new(), |misbehaviour| misbehaviour.to_string()),
             ]);
         }
         table
@@ -276,7 +276,7 @@ impl StatusWriter {
             last_result_s: progress.span.map(|(_, last)| now.saturating_duration_since(last).as_secs_f64()),
             latency_ms: progress.latency_ms,
             fused: progress.fused,
-            neighbours: progress.heard.clone(),
+            neighbours: progress.neighbours.clone(),
             dropped: progress.dropped,
             processes: processes(now),
         };
@@ -324,13 +324,13 @@ mod tests {
         assert!(matches!(RunStatus::newest(folder.path()), Err(StatusError::NoRun(_))));
         assert!(RunStatus::read(&run).unwrap_err().to_string().contains("status.json"));
         let mut writer = StatusWriter::new(&run, "test", "tcp/127.0.0.1:7447");
-        let attacker = HeardNeighbour {
+        let attacker = NeighbourState {
             cav: protocol::CavId::new("4279").unwrap(),
             trust: Some(0.03),
-            doubt: Some(protocol::MisbehaviourReason::GhostObjects),
+            misbehaviour: Some(protocol::MisbehaviourReason::GhostObjects),
             clock_offset_s: Some(0.0125),
         };
-        let progress = Progress { frames: 7, ticks: 9, heard: vec![attacker], ..Progress::default() };
+        let progress = Progress { frames: 7, ticks: 9, neighbours: vec![attacker], ..Progress::default() };
         writer.write(Phase::Running, &progress, |_| vec![process(State::Ready)]);
         // Not due yet.
         writer.write(Phase::Running, &Progress::default(), |_| Vec::new());

@@ -84,12 +84,12 @@ impl StatusReporter {
     ) -> Ending {
         loop {
             if stop.requested() {
-                display.say("ending");
+                display.print_line("ending");
                 return Ending::Asked;
             }
             let progress = scorer.progress();
             display.update(&progress);
-            for (name, why) in self.health.look(&progress.told, Instant::now()) {
+            for (name, why) in self.health.look(&progress.last_reports, Instant::now()) {
                 supervisor.replace(&name, &why);
             }
             self.tell(Phase::Running, &progress);
@@ -100,7 +100,7 @@ impl StatusReporter {
                 Err(RecvTimeoutError::Disconnected) => return Ending::Asked,
             };
             if let Some(failure) = self.note(&event) {
-                display.say(&format!("{}: {failure}", event.name));
+                display.print_line(&format!("{}: {failure}", event.name));
             }
             if let Some(ending) = show(event, display) {
                 return ending;
@@ -112,14 +112,16 @@ impl StatusReporter {
 /// Displays an event of a process; returns the end of the run where the event ends it.
 fn show(ProcessEvent { name, what }: ProcessEvent, display: &Display) -> Option<Ending> {
     match what {
-        ProcessEventKind::Started { pid } => display.say(&format!("{name} runs (pid {pid})")),
-        ProcessEventKind::Fell { how, again_after, restart } => display
-            .say(&format!("{name} {how}; starting it again in {:.1} s (restart {restart})", again_after.as_secs_f64())),
+        ProcessEventKind::Started { pid } => display.print_line(&format!("{name} runs (pid {pid})")),
+        ProcessEventKind::Crashed { how, again_after, restart } => display.print_line(&format!(
+            "{name} {how}; starting it again in {:.1} s (restart {restart})",
+            again_after.as_secs_f64()
+        )),
         ProcessEventKind::GaveUp { how, is_optional: false } => return Some(Ending::Failed { process: name, how }),
         // The replay is the clock of the run; the others follow it.
         ProcessEventKind::Done { .. } if name == REPLAY => return Some(Ending::Over),
         // Reported as failures, where they are some.
-        ProcessEventKind::Said { .. }
+        ProcessEventKind::Logged { .. }
         | ProcessEventKind::GaveUp { .. }
         | ProcessEventKind::Failed { .. }
         | ProcessEventKind::Done { .. } => {}

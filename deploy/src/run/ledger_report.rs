@@ -6,7 +6,7 @@ use bus::Rejection;
 use protocol::{Counts, Ledger, Reconciliation, StageSummary};
 use serde::Serialize;
 
-use crate::score::ProcessBooks;
+use crate::score::ProcessStats;
 
 /// Message accounting of a run.
 #[derive(Debug, Clone, Serialize)]
@@ -59,12 +59,12 @@ impl LedgerReport {
     /// that.
     #[must_use]
     pub fn new(
-        ledgers: &[ProcessBooks],
+        ledgers: &[ProcessStats],
         sum: &Ledger,
         balance: &Reconciliation,
         (away, exempted): (&BTreeSet<String>, u64),
     ) -> Self {
-        let process = |instance: &ProcessBooks| ProcessReport {
+        let process = |instance: &ProcessStats| ProcessReport {
             process: instance.process.to_string(),
             ledger: instance.ledger.clone(),
             stages: instance.stages.clone(),

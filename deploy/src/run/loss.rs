@@ -33,7 +33,7 @@ fn reasons(result: &RunResult) -> Vec<String> {
         reasons.push("most messages were still in flight at the end".into());
     }
     if !result.balance.is_exact() {
-        reasons.push(format!("{} accounts of ledger.json do not add up", result.balance.differences.len()));
+        reasons.push(format!("{} accounts of ledger.json do not add up", result.balance.discrepancies.len()));
     }
     reasons.extend(result.failures.iter().cloned());
     reasons.extend(result.killed.iter().map(|process| format!("{process} did not end in time")));

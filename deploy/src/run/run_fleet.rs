@@ -45,7 +45,7 @@ const LINES: [&str; 2] = ["detections.jsonl", "truth.jsonl"];
 
 /// Settings of a run beside its scenario.
 #[derive(Debug, Clone)]
-pub struct UpOptions {
+pub struct RunOptions {
     /// Folder of the run folders.
     pub runs: PathBuf,
     /// Folder of the programs `agent`, `ego-fuser` and `sim-replay`.
@@ -95,9 +95,9 @@ impl RunResult {
 ///
 /// # Errors
 /// [`RunError`] when the run cannot start, or a process stays down.
-pub fn up(scenario: &Scenario, options: &UpOptions) -> Result<RunResult, RunError> {
+pub fn run_scenario(scenario: &Scenario, options: &RunOptions) -> Result<RunResult, RunError> {
     if scenario.clock == Clock::Stepped {
-        return crate::run::stepped::up(scenario, options);
+        return crate::run::stepped::run_scenario(scenario, options);
     }
     let fleet = Fleet::plan(scenario)?;
     let run = fleet.scenario.run.clone().unwrap_or_else(|| name_of_now(options.prefix));
@@ -123,7 +123,7 @@ fn announce_capacity(fleet: &Fleet) -> Option<Capacity> {
 }
 
 /// Runs a fleet under the given run name in the given folder.
-fn go(fleet: &Fleet, options: &UpOptions, run: &RunId, folder: &RunFolder) -> Result<RunResult, RunError> {
+fn go(fleet: &Fleet, options: &RunOptions, run: &RunId, folder: &RunFolder) -> Result<RunResult, RunError> {
     let stop = Stop::new();
     stop.on_signals().map_err(RunError::Signals)?;
     // Before anything else of the run takes the cores.
@@ -199,11 +199,15 @@ fn watch(
     let mut display = Display::new(fleet.ticks);
     for ProcessSpec { name, metrics, .. } in &specs {
         if let Some(address) = metrics {
-            display.say(&format!("metrics of {name} at http://{address}/metrics"));
+            display.print_line(&format!("metrics of {name} at http://{address}/metrics"));
         }
     }
     let restarts = fleet.scenario.timeouts.restarts;
-    display.say(&format!("run {run} at {endpoint}: {} processes, logs in {}", specs.len(), folder.log_dir().display()));
+    display.print_line(&format!(
+        "run {run} at {endpoint}: {} processes, logs in {}",
+        specs.len(),
+        folder.log_dir().display()
+    ));
     let mut supervisor = Supervisor::start(specs, &folder.log_dir(), restarts, &events)?;
     let mut watch = StatusReporter::new(fleet, run, endpoint, folder);
     let ending = watch.follow(&supervisor, &happened, scorer, stop, &mut display);
@@ -285,7 +289,7 @@ fn write(
     fingerprint: JoinHandle<std::io::Result<Provenance>>,
     capacity: Option<Capacity>,
 ) -> RunResult {
-    let Scored { board, books, progress, unwritten: lines } = scored;
+    let Scored { board, stats, progress, unwritten: lines } = scored;
     let mut unwritten = Vec::new();
     for (name, lines) in LINES.iter().zip(lines).filter(|(_, lines)| *lines > 0) {
         unwritten.push(format!("{lines} lines are missing in {}", folder.file(name).display()));
@@ -296,7 +300,7 @@ fn write(
         }
     };
     let mut sum = Ledger::default();
-    for process in &books {
+    for process in &stats {
         sum.merge(&process.ledger);
     }
     let exempted = sum.exempt(|account| offline_intervals::concerns(&watched.offline, account));
@@ -306,10 +310,10 @@ fn write(
     let metrics = Metrics { ticks: metrics.answered + missed, ..metrics };
     note(folder.write_json("metrics.json", &metrics));
     let remedies = remedies(fleet, capacity.as_ref());
-    let run_report = RunReport::new(run, &metrics, board.records(), &books, capacity);
+    let run_report = RunReport::new(run, &metrics, board.records(), &stats, capacity);
     note(folder.write_json(report::FILE, &run_report));
     note(folder.write_frames(board.records(), &swept(&folder.file(SWEEP_LOG))));
-    let report = LedgerReport::new(&books, &sum, &balance, (&watched.offline, exempted)).with_refused(refused);
+    let report = LedgerReport::new(&stats, &sum, &balance, (&watched.offline, exempted)).with_refused(refused);
     note(folder.write_json("ledger.json", &report));
     let provenance = match fingerprint.join() {
         Ok(Ok(provenance)) => Some(provenance),

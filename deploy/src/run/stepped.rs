@@ -24,7 +24,7 @@ use crate::operate::fleet::{Fleet, FleetError, open_options};
 use crate::operate::run_folder::{RunFolder, RunFolderError, name_of_now};
 use crate::run::ledger_report::LedgerReport;
 use crate::run::report::{self, RunReport};
-use crate::run::run_fleet::{RunResult, UpOptions};
+use crate::run::run_fleet::{RunOptions, RunResult};
 use crate::scenario::fingerprint::Provenance;
 use crate::scenario::{Scenario, Stepped};
 use crate::score::evaluated_frame::judge;
@@ -35,7 +35,7 @@ use crate::score::{FrameScores, TruthLine};
 ///
 /// # Errors
 /// [`RunError`] when no fleet can be built from the scenario, or a frame cannot be read or computed.
-pub fn up(scenario: &Scenario, options: &UpOptions) -> Result<RunResult, RunError> {
+pub fn run_scenario(scenario: &Scenario, options: &RunOptions) -> Result<RunResult, RunError> {
     let mut fleet = Fleet::plan(scenario)?;
     fleet.scenario.models.threads.apply();
     let recorded = recorded(&fleet)?;
@@ -63,7 +63,7 @@ fn go(
     recorded: &Recorded,
     evaluator: &mut Evaluator,
     (run, folder): (&RunId, &RunFolder),
-    options: &UpOptions,
+    options: &RunOptions,
 ) -> Result<RunResult, RunError> {
     let processes = fleet.scenario.stepped.is_some_and(|stepped| stepped.processes);
     let crew = processes.then(|| CrewProcesses::start(fleet, run, folder, &options.programs)).transpose()?;
@@ -128,8 +128,8 @@ fn stepped_config(fleet: &Fleet, compute: ComputeTimes) -> Result<SteppedConfig,
 }
 
 fn vehicle(scenario: &Scenario, cav: &CavId) -> VehicleConfig {
-    let AgentSettings { pose, codec, rate, lie } = scenario.settings_of(cav);
-    VehicleConfig { pose_source: for_scene(&pose, scenario), codec, rate, lie }
+    let AgentSettings { pose, codec, rate, falsification } = scenario.settings_of(cav);
+    VehicleConfig { pose_source: for_scene(&pose, scenario), codec, rate, falsification }
 }
 
 /// The source as in the configuration of an agent's process.
@@ -182,7 +182,7 @@ fn write(
     evaluator: &Evaluator,
     board: &FrameScores,
     (run, folder): (&RunId, RunFolder),
-    options: &UpOptions,
+    options: &RunOptions,
 ) -> Result<RunResult, RunError> {
     let ledger = evaluator.ledger();
     let balance = ledger.balance();

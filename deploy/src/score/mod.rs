@@ -19,7 +19,7 @@ mod truth_line;
 pub use frame_record::{FrameRecord, JudgedFrame, StreamedResult};
 pub use frame_scores::FrameScores;
 pub use neighbours::NeighbourRecord;
-pub use node::{ProcessBooks, Progress, Scored, ScorerError, ScorerNode, scorer_cav};
+pub use node::{ProcessStats, Progress, Scored, ScorerError, ScorerNode, scorer_cav};
 pub use stage_stamps::StageStamps;
 pub use true_boxes::true_boxes;
 pub use truth_line::TruthLine;

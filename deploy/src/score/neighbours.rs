@@ -16,7 +16,7 @@ pub struct NeighbourRecord {
     /// Number of frames without its data, by reason; frames without a message of it are not counted.
     pub left_out: BTreeMap<DropReason, u64>,
     /// Number of frames that it was excluded from by misbehaviour detection, by reason.
-    pub doubts: BTreeMap<MisbehaviourReason, u64>,
+    pub misbehaviour_counts: BTreeMap<MisbehaviourReason, u64>,
     /// Trust score of the neighbour at the end, 0..=1; `None` without misbehaviour detection.
     pub trust: Option<f64>,
     /// Lowest trust score.
@@ -25,7 +25,7 @@ pub struct NeighbourRecord {
     /// simulation time.
     pub clock_offset_s: Option<f64>,
     /// Misbehaviour reason at the end, if it was excluded.
-    pub doubt: Option<MisbehaviourReason>,
+    pub misbehaviour: Option<MisbehaviourReason>,
 }
 
 /// Adds the neighbours of a result.
@@ -43,16 +43,16 @@ pub(super) fn add(neighbours: &mut BTreeMap<CavId, NeighbourRecord>, result: &De
             change(&skipped.cav, &|record| *record.left_out.entry(reason).or_default() += 1);
         }
     }
-    for heard in &result.heard {
-        change(&heard.cav, &|record| {
-            if let Some(doubt) = heard.doubt {
-                *record.doubts.entry(doubt).or_default() += 1;
+    for neighbour in &result.neighbours {
+        change(&neighbour.cav, &|record| {
+            if let Some(misbehaviour) = neighbour.misbehaviour {
+                *record.misbehaviour_counts.entry(misbehaviour).or_default() += 1;
             }
-            record.doubt = heard.doubt;
+            record.misbehaviour = neighbour.misbehaviour;
             // One that cannot be fused gets no new trust score.
-            record.trust = heard.trust.or(record.trust);
-            record.least_trust = [record.least_trust, heard.trust].into_iter().flatten().reduce(f64::min);
-            record.clock_offset_s = heard.clock_offset_s.or(record.clock_offset_s);
+            record.trust = neighbour.trust.or(record.trust);
+            record.least_trust = [record.least_trust, neighbour.trust].into_iter().flatten().reduce(f64::min);
+            record.clock_offset_s = neighbour.clock_offset_s.or(record.clock_offset_s);
         });
     }
 }

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use bus::bounded_queue::Pop;
 use bus::{Arrival, Bus, BusError, Event, Identity, Inbox, LivelinessToken, Subscription, process_id, process_usage};
 use protocol::{
-    CavId, Detections, DetectionsReport, HeardNeighbour, KeyExpr, Ledger, Limits, PoseEstimate, ProcessId,
+    CavId, Detections, DetectionsReport, KeyExpr, Ledger, Limits, NeighbourState, PoseEstimate, ProcessId,
     ProcessUsage, Role, RunId, StageSummary, Stats, Stream, Topic, TopicTraffic, Truth,
 };
 use zenoh::Session;
@@ -40,7 +40,7 @@ pub struct Progress {
     /// Number of neighbours in the last result.
     pub fused: usize,
     /// Neighbours whose messages the ego received for the last result, and its judgement of each.
-    pub heard: Vec<HeardNeighbour>,
+    pub neighbours: Vec<NeighbourState>,
     /// Bytes of all fused messages so far.
     pub wire_bytes: u64,
     /// Number of messages dropped so far, by all processes.
@@ -48,7 +48,7 @@ pub struct Progress {
     /// True once the replay has announced the end of the scene.
     pub ended: bool,
     /// Time of the last report of each process, by name.
-    pub told: BTreeMap<String, Instant>,
+    pub last_reports: BTreeMap<String, Instant>,
 }
 
 impl Progress {
@@ -63,7 +63,7 @@ impl Progress {
 
 /// Ledger and resources of one process instance.
 #[derive(Debug, Clone)]
-pub struct ProcessBooks {
+pub struct ProcessStats {
     /// Name of the process.
     pub process: ProcessId,
     /// Its message counters.
@@ -82,14 +82,14 @@ pub struct ProcessBooks {
 const MAX_INSTANCES: usize = 1024;
 
 /// Last ledger of every process and epoch.
-type ScoreStats = BTreeMap<(ProcessId, u64), ProcessBooks>;
+type ScoreStats = BTreeMap<(ProcessId, u64), ProcessStats>;
 
 /// Results of the scorer at the end.
 pub struct Scored {
     /// Detections against the truth.
     pub board: FrameScores,
     /// Last report of every process instance.
-    pub books: Vec<ProcessBooks>,
+    pub stats: Vec<ProcessStats>,
     /// Progress of the run.
     pub progress: Progress,
     /// Number of results and of ticks that are not in their files, for lack of disk space.
@@ -159,9 +159,9 @@ impl ScorerNode {
         let progress = Arc::<Mutex<Progress>>::default();
         let worker = Worker {
             inbox: Arc::clone(&inbox),
-            bus_stats: bus.books().clone(),
+            bus_stats: bus.stats().clone(),
             board,
-            books: BTreeMap::new(),
+            stats: BTreeMap::new(),
             progress: Arc::clone(&progress),
             detections,
             truth_lines,
@@ -201,11 +201,11 @@ impl ScorerNode {
     #[must_use]
     pub fn finish(self) -> Scored {
         self.inbox.close();
-        let (board, books, unwritten) = self.thread.join().expect("the scorer's thread has no reason to panic");
-        let stats = self.bus.books();
+        let (board, stats, unwritten) = self.thread.join().expect("the scorer's thread has no reason to panic");
+        let stats = self.bus.stats();
         let process = self.bus.identity().process.clone();
-        let cpu_before_s = books.values().find(|books| books.process == process).map_or(0.0, |own| own.cpu_before_s);
-        let own = ProcessBooks {
+        let cpu_before_s = stats.values().find(|stats| stats.process == process).map_or(0.0, |own| own.cpu_before_s);
+        let own = ProcessStats {
             process,
             ledger: stats.ledger(),
             stages: stats.stages(),
@@ -219,8 +219,8 @@ impl ScorerNode {
             tracing::warn!("{overdue}");
         }
         // The scorer receives its own reports like those of others; its current counters are newer.
-        let others = books.into_values().filter(|books| books.process != own.process);
-        Scored { board, books: others.chain([own.clone()]).collect(), progress, unwritten }
+        let others = stats.into_values().filter(|stats| stats.process != own.process);
+        Scored { board, stats: others.chain([own.clone()]).collect(), progress, unwritten }
     }
 }
 
@@ -238,7 +238,7 @@ struct Worker {
     inbox: Arc<Inbox>,
     bus_stats: bus::MessageStats,
     board: FrameScores,
-    books: ScoreStats,
+    stats: ScoreStats,
     progress: Arc<Mutex<Progress>>,
     detections: ResultLines,
     truth_lines: ResultLines,
@@ -259,7 +259,7 @@ impl Worker {
         }
         self.write_results(true);
         self.board.close();
-        (self.board, self.books, [self.detections.finish(), self.truth_lines.finish()])
+        (self.board, self.stats, [self.detections.finish(), self.truth_lines.finish()])
     }
 
     fn take(&mut self, topic: &Topic, arrival: &Arrival) {
@@ -301,7 +301,7 @@ impl Worker {
         self.write_results(false);
         let began = self.published.get(&stamp.capture_nanos);
         let latency_ms = began.map(|began| (stamp.publish_nanos as f64 - *began as f64) / 1e6);
-        let heard = result.heard.clone();
+        let neighbours = result.neighbours.clone();
         let (fused, bytes) =
             (result.fused.len(), result.fused.iter().map(|neighbour| neighbour.wire_bytes).sum::<u64>());
         let latency = latency_ms.map(|ms| Duration::from_secs_f64(ms.max(0.0) / 1e3));
@@ -312,7 +312,7 @@ impl Worker {
             progress.span = Some((progress.span.map_or(at, |(first, _)| first), at));
             progress.latency_ms = latency_ms;
             progress.fused = fused;
-            progress.heard = heard;
+            progress.neighbours = neighbours;
             progress.wire_bytes += bytes;
         });
         self.board.result(stamp, result);
@@ -339,7 +339,7 @@ impl Worker {
         };
         // A restarted process has another epoch: both instances count.
         let instance = (process.clone(), arrival.header.stamp.epoch);
-        let has_room = self.books.len() < MAX_INSTANCES || self.books.contains_key(&instance);
+        let has_room = self.stats.len() < MAX_INSTANCES || self.stats.contains_key(&instance);
         if process != *sender || !has_room {
             return tracing::warn!(%sender, %process, "report with another process's name, or of too many processes: ignored");
         }
@@ -347,14 +347,14 @@ impl Worker {
         // Until the first tick: the loading of models belongs to no frame.
         let cpu_before_s = match self.published.is_empty() {
             true => usage.cpu_s,
-            false => self.books.get(&instance).map_or(0.0, |known| known.cpu_before_s),
+            false => self.stats.get(&instance).map_or(0.0, |known| known.cpu_before_s),
         };
-        let books = ProcessBooks { process, ledger, stages, usage, cpu_before_s, traffic };
-        self.books.insert(instance, books);
-        let dropped = self.books.values().map(|books| books.ledger.total().dropped_total()).sum();
+        let stats = ProcessStats { process, ledger, stages, usage, cpu_before_s, traffic };
+        self.stats.insert(instance, stats);
+        let dropped = self.stats.values().map(|stats| stats.ledger.total().dropped_total()).sum();
         self.note(|progress| {
             progress.dropped = dropped;
-            progress.told.insert(name, at);
+            progress.last_reports.insert(name, at);
         });
     }
 

@@ -54,8 +54,8 @@ mod tests {
         let stamp = Stamp { cav: ego.clone(), epoch: 1, sequence: 0, capture_nanos, publish_nanos: 0 };
         let pose = PoseEstimate::new(Pose::IDENTITY, 1.0);
         let (agent_frame, method) = (0, "max".to_owned());
-        let (detections, fused, skipped, heard, stages) = Default::default();
-        let result = Detections { ego, agent_frame, method, pose, detections, fused, skipped, heard, stages };
+        let (detections, fused, skipped, neighbours, stages) = Default::default();
+        let result = Detections { ego, agent_frame, method, pose, detections, fused, skipped, neighbours, stages };
         DetectionsReport::new(&stamp, None, result)
     }
 

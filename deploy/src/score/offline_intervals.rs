@@ -38,10 +38,10 @@ impl OfflineIntervals {
             bus.watch(role, move |event| {
                 let mut state = state.lock().unwrap_or_else(PoisonError::into_inner);
                 match event {
-                    LivelinessEvent::Vanished { role, cav } => {
+                    LivelinessEvent::Left { role, cav } => {
                         state.gone.insert(process_id(role, &cav).to_string());
                     }
-                    LivelinessEvent::Appeared { role, cav } => {
+                    LivelinessEvent::Joined { role, cav } => {
                         let name = process_id(role, &cav).to_string();
                         if state.gone.remove(&name) {
                             state.returned.insert(name);

@@ -106,7 +106,7 @@ mod tests {
             detections: vec![],
             fused: vec![],
             skipped: vec![],
-            heard: vec![],
+            neighbours: vec![],
             stages: vec![],
         };
         DetectionsReport::new(&stamp, Some(tick), result)

@@ -19,7 +19,7 @@ const MOST_VEHICLES: usize = 128;
 
 /// A captured message.
 #[derive(Debug, Clone, Copy)]
-pub struct Seen<'a> {
+pub struct ReceivedMessage<'a> {
     /// Topic of its publication.
     pub topic: &'a Topic,
     /// Header of the message.
@@ -68,7 +68,7 @@ struct Arrival {
 impl FrameAssembler {
     /// Adds a message. A result completes its scene frame, which is returned; so is a scene frame without a result when
     /// too many wait. Invalid messages are ignored here and counted by their receivers.
-    pub fn add(&mut self, seen: &Seen<'_>) -> Option<SceneFrame> {
+    pub fn add(&mut self, seen: &ReceivedMessage<'_>) -> Option<SceneFrame> {
         if let Topic::Stats(_) = seen.topic {
             self.keep_ledger(seen);
             return None;
@@ -118,7 +118,7 @@ impl FrameAssembler {
         *self = Self::default();
     }
 
-    fn keep_ledger(&mut self, seen: &Seen<'_>) {
+    fn keep_ledger(&mut self, seen: &ReceivedMessage<'_>) {
         let Some(Stats { process, ledger, stages, .. }) = decode(seen) else { return };
         let process = process.to_string();
         if self.ledgers.len() < MOST_LEDGERS || self.ledgers.contains_key(&process) {
@@ -135,7 +135,7 @@ impl FrameAssembler {
     }
 
     /// Adds a message to its scene frame; returns true if that is complete now.
-    fn fill(&mut self, at: u64, seen: &Seen<'_>) -> bool {
+    fn fill(&mut self, at: u64, seen: &ReceivedMessage<'_>) -> bool {
         let published = seen.header.stamp.publish_nanos;
         match seen.topic {
             Topic::Truth => {
@@ -176,7 +176,7 @@ impl FrameAssembler {
         false
     }
 
-    fn arrived(&mut self, at: u64, cav: &CavId, stream: Stream, rank: u8, seen: &Seen<'_>) {
+    fn arrived(&mut self, at: u64, cav: &CavId, stream: Stream, rank: u8, seen: &ReceivedMessage<'_>) {
         let rank = match stream {
             Stream::Bev | Stream::Boxes | Stream::Points => rank + 1,
             Stream::Pose => rank,
@@ -194,7 +194,7 @@ impl FrameAssembler {
     }
 }
 
-fn decode<M: Payload>(seen: &Seen<'_>) -> Option<M> {
+fn decode<M: Payload>(seen: &ReceivedMessage<'_>) -> Option<M> {
     wire::decode([seen.payload?], &Limits::DEFAULT).map(|(_, message)| message).ok()
 }
 
@@ -352,8 +352,8 @@ impl OpenFrame {
             result.skipped.iter().map(|neighbour| Link { skipped: neighbour.reason, ..link(&neighbour.cav) }).collect();
         let mut all: Vec<Link> = fused.into_iter().chain(skipped).chain(links.into_values()).collect();
         for link in &mut all {
-            let Some(known) = result.heard.iter().find(|heard| heard.cav.as_str() == link.from) else { continue };
-            (link.trust, link.doubt) = (known.trust, known.doubt);
+            let Some(known) = result.neighbours.iter().find(|state| state.cav.as_str() == link.from) else { continue };
+            (link.trust, link.misbehaviour) = (known.trust, known.misbehaviour);
             link.clock_ms = known.clock_offset_s.map(|seconds| seconds * 1e3);
         }
         all

@@ -13,7 +13,7 @@ use protocol::{KeyExpr, Kind, RunId, Stream, wire};
 use tokio::sync::watch;
 use tokio::time::{sleep, timeout};
 
-use super::frame_assembler::{FrameAssembler, Seen};
+use super::frame_assembler::{FrameAssembler, ReceivedMessage};
 
 /// Largest number of waiting messages of one key.
 const PLACES: usize = 4;
@@ -175,7 +175,7 @@ impl Listener {
         }
         let topic = &message.key.topic;
         let (arrived_nanos, payload) = (message.arrived_nanos, Some(bytes.as_ref()));
-        let seen = Seen { topic, header: &header, arrived_nanos, payload };
+        let seen = ReceivedMessage { topic, header: &header, arrived_nanos, payload };
         if let Some(frame) = self.assembly.add(&seen).filter(|_| self.is_watched()) {
             let frame = frame.to_bytes();
             let len = (frame.len() as u32).to_le_bytes();

@@ -14,7 +14,7 @@ mod server;
 #[cfg(test)]
 mod tests;
 
-pub use frame_assembler::{FrameAssembler, Seen};
+pub use frame_assembler::{FrameAssembler, ReceivedMessage};
 pub use live::LiveRun;
 pub use pace_counter::ShownPace;
 pub use recorded::{RecordedRun, ViewError};

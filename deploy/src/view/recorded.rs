@@ -8,7 +8,7 @@ use protocol::{Detections, Limits, PoseEstimate, Stream, Topic, Truth, wire};
 use recording::{Entry, Recording, RecordingError};
 use serde::Serialize;
 
-use super::frame_assembler::{FrameAssembler, Seen};
+use super::frame_assembler::{FrameAssembler, ReceivedMessage};
 use super::pace_counter::PaceCounter;
 use super::scene_frame::SceneFrame;
 use crate::operate::run_folder::{RECORDING, SWEEP_LOG};
@@ -148,7 +148,7 @@ impl RecordedRun {
             let payload = if is_wanted(&entry.key.topic) { Some(self.recording.read(entry)?) } else { None };
             let Entry { key, header, arrived_nanos, .. } = entry;
             let (topic, payload) = (&key.topic, payload.as_deref());
-            let shown = assembly.add(&Seen { topic, header, arrived_nanos: *arrived_nanos, payload });
+            let shown = assembly.add(&ReceivedMessage { topic, header, arrived_nanos: *arrived_nanos, payload });
             if shown.is_some() {
                 return Ok(shown.map(|frame| self.with_sweep(frame, moment)));
             }

@@ -126,7 +126,7 @@ pub struct Link {
     /// Trust score of the sender, 0..=1, if the receiver uses misbehaviour detection.
     pub trust: Option<f64>,
     /// Misbehaviour reason, if the sender was excluded.
-    pub doubt: Option<MisbehaviourReason>,
+    pub misbehaviour: Option<MisbehaviourReason>,
     /// Offset of the sender's clock from the receiver's, less the shortest transmission time, milliseconds.
     pub clock_ms: Option<f64>,
 }

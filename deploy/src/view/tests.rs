@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 
 use bus::web::fetch;
 use bus::{Bus, BusOptions, Endpoint, Identity, PublisherOptions};
-use protocol::message::{AgentTruth, FusedNeighbour, HeardNeighbour, StageTiming};
+use protocol::message::{AgentTruth, FusedNeighbour, NeighbourState, StageTiming};
 use protocol::{
     Box3d, CavId, Detection, Detections, Key, Lidar, PointCloud, Pose, PoseEstimate, RunId, Stamp, Stream, Topic,
     TrueObject, Truth, wire,
@@ -23,7 +23,7 @@ use super::*;
 const EGO: &str = "4279";
 const OTHER: &str = "4288";
 const TICKS: u64 = 5;
-const PATIENCE: Duration = Duration::from_secs(120);
+const TIMEOUT: Duration = Duration::from_secs(120);
 
 fn cav(text: &str) -> CavId {
     CavId::new(text).unwrap()
@@ -73,7 +73,12 @@ fn detections(tick: u64) -> Detections {
             wire_bytes: 1_250,
         }],
         skipped: Vec::new(),
-        heard: vec![HeardNeighbour { cav: cav(OTHER), trust: Some(0.75), doubt: None, clock_offset_s: Some(-0.25) }],
+        neighbours: vec![NeighbourState {
+            cav: cav(OTHER),
+            trust: Some(0.75),
+            misbehaviour: None,
+            clock_offset_s: Some(-0.25),
+        }],
         stages: vec![
             StageTiming::new("wait", Duration::from_millis(12)),
             StageTiming::new("fuse", Duration::from_millis(8)),
@@ -181,7 +186,7 @@ fn a_replay_that_begins_anew_is_shown_from_its_beginning() {
         for (topic, payload) in messages(tick, 0, Stream::Lidar) {
             let mut header = wire::decode_header([payload.as_slice()]).unwrap();
             header.stamp.epoch = epoch;
-            let seen = Seen { topic: &topic, header: &header, arrived_nanos: 0, payload: Some(&payload) };
+            let seen = ReceivedMessage { topic: &topic, header: &header, arrived_nanos: 0, payload: Some(&payload) };
             frames.extend(assembly.add(&seen).and_then(|frame| frame.tick));
         }
         frames
@@ -200,7 +205,7 @@ fn ticks_without_a_result_count_as_unanswered_once_a_later_one_is_shown() {
         let is_result = |topic: &Topic| matches!(topic, Topic::Stream { stream: Stream::Detections, .. });
         for (topic, payload) in messages(tick, 100_000_000 * tick, Stream::Preview) {
             let header = wire::decode_header([payload.as_slice()]).unwrap();
-            let seen = Seen { topic: &topic, header: &header, arrived_nanos: 0, payload: Some(&payload) };
+            let seen = ReceivedMessage { topic: &topic, header: &header, arrived_nanos: 0, payload: Some(&payload) };
             if !is_result(&topic) || tick % 2 == 1 {
                 pace.extend(assembly.add(&seen).map(|frame| (frame.pace.answered, frame.pace.ticks)));
             }
@@ -252,7 +257,7 @@ fn publish(bus: Bus, ending: &AtomicBool) {
             let options = if is_preview { PublisherOptions::PREVIEW } else { PublisherOptions::SENSOR };
             let publisher = publishers.entry(topic.clone()).or_insert_with(|| bus.publisher(topic, options).unwrap());
             // Unchanged: stamp and all.
-            publisher.offer_encoded(0, move |_| Ok(protocol::Encoded { head: payload, body: protocol::Body::Empty }));
+            publisher.submit_encoded(0, move |_| Ok(protocol::Encoded { head: payload, body: protocol::Body::Empty }));
         }
         std::thread::sleep(Duration::from_millis(50));
         if ending.load(Ordering::Relaxed) {
@@ -292,7 +297,7 @@ fn a_live_run_is_shown_and_a_slow_page_delays_no_other() {
 /// `count` moments of a live run.
 fn moments_of(address: SocketAddr, count: u64) -> Vec<Vec<u8>> {
     let mut connection = TcpStream::connect(address).unwrap();
-    connection.set_read_timeout(Some(PATIENCE)).unwrap();
+    connection.set_read_timeout(Some(TIMEOUT)).unwrap();
     write!(connection, "GET /live?frames={count} HTTP/1.0\r\n\r\n").unwrap();
     let mut answer = Vec::new();
     connection.read_to_end(&mut answer).unwrap();
@@ -309,7 +314,7 @@ fn moments_of(address: SocketAddr, count: u64) -> Vec<Vec<u8>> {
 }
 
 fn wait_for(what: &str, condition: impl Fn() -> bool) {
-    let deadline = Instant::now() + PATIENCE;
+    let deadline = Instant::now() + TIMEOUT;
     while !condition() {
         assert!(Instant::now() < deadline, "{what}");
         std::thread::sleep(Duration::from_millis(10));

@@ -117,8 +117,8 @@ fn cases(config: &DetectorConfig) -> Vec<Case> {
     let methods = Method::ALL.into_iter().filter(|method| method.exchange() == Exchange::Features);
     let mut cases: Vec<_> = methods.map(|method| case(&method.to_string(), method, &usual(method), false)).collect();
     let pastat = usual(Method::PASTAT);
-    let no_recall = ablated(&pastat, &[Part::TemporalMemory], None).expect("it is a PASTAT");
-    cases.push(case("pastat-no-recall", Method::PASTAT, &no_recall, false));
+    let no_memory = ablated(&pastat, &[Part::TemporalMemory], None).expect("it is a PASTAT");
+    cases.push(case("pastat-no-memory", Method::PASTAT, &no_memory, false));
     cases.push(case("pastat-lost", Method::PASTAT, &pastat, true));
     cases
 }

@@ -98,9 +98,9 @@ mod tests {
     #[test]
     fn untrained_it_changes_nothing() {
         let variables = VarStore::new(Device::Cpu);
-        let steering = ChannelMixing::new(&variables.root(), 4);
+        let mixing = ChannelMixing::new(&variables.root(), 4);
         let features = Tensor::rand([2, 4, 3, 5], FLOAT);
-        assert_eq!(steering.turn(&features, &[Pose::IDENTITY, turned(1.0)]).unwrap(), features);
+        assert_eq!(mixing.turn(&features, &[Pose::IDENTITY, turned(1.0)]).unwrap(), features);
     }
 
     #[test]
@@ -108,10 +108,10 @@ mod tests {
         let weight = Tensor::zeros([BASIS, 2, 2], FLOAT);
         // Channel 0 gains sin(heading) of channel 1: a direction along y now has a part along x.
         let _ = weight.get(2).get(0).get(1).fill_(1.0);
-        let steering = ChannelMixing { weight };
+        let mixing = ChannelMixing { weight };
         let features = Tensor::ones([3, 2, 1, 1], FLOAT);
         let poses = [Pose::IDENTITY, turned(FRAC_PI_2), turned(PI)];
-        let out = Vec::<f32>::try_from(steering.turn(&features, &poses).unwrap().view(-1)).unwrap();
+        let out = Vec::<f32>::try_from(mixing.turn(&features, &poses).unwrap().view(-1)).unwrap();
         let expected = [1.0, 1.0, 2.0, 1.0, 1.0, 1.0];
         assert!(out.iter().zip(expected).all(|(found, expected)| (found - expected).abs() < 1e-6), "{out:?}");
     }
@@ -119,16 +119,16 @@ mod tests {
     #[test]
     fn the_order_of_numbers_in_memory_changes_nothing() {
         let weight = Tensor::rand([BASIS, 3, 3], FLOAT) - 0.5;
-        let (steering, planes) = (ChannelMixing { weight }, Tensor::rand([1, 3, 4, 5], FLOAT));
+        let (mixing, planes) = (ChannelMixing { weight }, Tensor::rand([1, 3, 4, 5], FLOAT));
         let cells = planes.permute([0, 2, 3, 1]).contiguous().permute([0, 3, 1, 2]);
-        let [planes, cells] = [planes, cells].map(|maps| steering.turn(&maps, &[turned(0.4)]).unwrap());
+        let [planes, cells] = [planes, cells].map(|maps| mixing.turn(&maps, &[turned(0.4)]).unwrap());
         assert!(planes.allclose(&cells, 1e-6, 1e-6, false));
     }
 
     #[test]
     fn another_number_of_channels_is_refused() {
         let variables = VarStore::new(Device::Cpu);
-        let steering = ChannelMixing::new(&variables.root(), 4);
-        assert!(steering.turn(&Tensor::ones([1, 3, 2, 2], FLOAT), &[turned(0.5)]).is_err());
+        let mixing = ChannelMixing::new(&variables.root(), 4);
+        assert!(mixing.turn(&Tensor::ones([1, 3, 2, 2], FLOAT), &[turned(0.5)]).is_err());
     }
 }

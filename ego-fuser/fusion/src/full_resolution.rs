@@ -92,9 +92,9 @@ impl FullResolutionMap {
                 Ok(CellSamples { features: of(&features)?, mask: of(&mask)? })
             }
             Self::Tensors { map, sent } => {
-                let lattice = Tensor::f_from_slice(places)?.f_view([1, 1, -1, 2])?.f_to_device(map.device())?;
+                let sampling_grid = Tensor::f_from_slice(places)?.f_view([1, 1, -1, 2])?.f_to_device(map.device())?;
                 let read = |map: &Tensor, how| {
-                    let read = map.f_grid_sampler(&lattice, how, PADDING_ZEROS, false)?;
+                    let read = map.f_grid_sampler(&sampling_grid, how, PADDING_ZEROS, false)?;
                     read.f_squeeze_dim(2)?.f_squeeze_dim(0)?.f_transpose(0, 1)
                 };
                 let mask = read(sent, NEAREST)?.f_ceil()?;

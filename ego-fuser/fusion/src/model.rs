@@ -21,7 +21,7 @@ use tch::{Device, Kind, TchError, Tensor};
 
 use crate::method::{Method, UnknownMethod};
 use crate::own::OwnConfig;
-use crate::targets::{LatticeError, TargetAssigner, TargetRule};
+use crate::targets::{AnchorGridError, TargetAssigner, TargetRule};
 use crate::warp::WarpError;
 use crate::where2comm::most_confident;
 use crate::{AlignedMaps, FUSION_KEY, FusionConfig, FusionOutput, MapMetadata, ReceivedMaps, channel_mixing};
@@ -54,12 +54,12 @@ pub enum ModelError {
     #[error(transparent)]
     Decode(#[from] DecodeError),
     /// Numbers of metadata entries and views differ.
-    #[error("{views} views encoded, but the samples have metadata of {told}")]
+    #[error("{views} views encoded, but the samples have metadata of {described}")]
     ViewCount {
         /// Feature maps.
         views: i64,
         /// Metadata entries over all samples.
-        told: usize,
+        described: usize,
     },
 }
 
@@ -216,12 +216,12 @@ impl CooperativeModel {
         facts: &[Vec<MapMetadata>],
         train: bool,
     ) -> Result<CooperativeOutput, ModelError> {
-        let told: usize = facts.iter().map(Vec::len).sum();
+        let described: usize = facts.iter().map(Vec::len).sum();
         let views = features.size4()?.0;
-        if views != told as i64 {
-            return Err(ModelError::ViewCount { views, told });
+        if views != described as i64 {
+            return Err(ModelError::ViewCount { views, described });
         }
-        if self.fusion.config().settings::<OwnConfig>().is_some() && told == facts.len() {
+        if self.fusion.config().settings::<OwnConfig>().is_some() && described == facts.len() {
             let corrections = facts.iter().map(|_| None).collect();
             return Ok(CooperativeOutput { head: self.network.heads(features)?, corrections });
         }
@@ -286,8 +286,8 @@ impl CooperativeModel {
     /// The assigner of a frame's targets to the anchors of the head.
     ///
     /// # Errors
-    /// [`LatticeError`] when the configuration has no anchors.
-    pub fn assigner(&self) -> Result<TargetAssigner, LatticeError> {
+    /// [`AnchorGridError`] when the configuration has no anchors.
+    pub fn assigner(&self) -> Result<TargetAssigner, AnchorGridError> {
         let anchors = &self.anchors;
         let boxes = (0..anchors.len()).map(|index| {
             let [x, y, z, h, w, l, yaw] = anchors.get(index);

@@ -47,7 +47,7 @@ pub struct Labels {
 
 /// Error of the anchors of a head.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub enum LatticeError {
+pub enum AnchorGridError {
     /// The number of anchors is not the product of the shape.
     #[error("{found} anchors do not fill a grid of {height} x {width} x {per_cell}")]
     Count {
@@ -85,11 +85,11 @@ impl TargetAssigner {
     /// Prepares `anchors`, flat in the order row (y), column (x), anchor of the cell; `shape` is `[H, W, A]`.
     ///
     /// # Errors
-    /// [`LatticeError`] when the anchors do not fill the shape or are not on a grid.
-    pub fn new(anchors: Vec<Box3d>, shape: [usize; 3], rule: TargetRule) -> Result<Self, LatticeError> {
+    /// [`AnchorGridError`] when the anchors do not fill the shape or are not on a grid.
+    pub fn new(anchors: Vec<Box3d>, shape: [usize; 3], rule: TargetRule) -> Result<Self, AnchorGridError> {
         let [height, width, per_cell] = shape;
         if anchors.len() != height * width * per_cell || anchors.is_empty() {
-            return Err(LatticeError::Count { found: anchors.len(), height, width, per_cell });
+            return Err(AnchorGridError::Count { found: anchors.len(), height, width, per_cell });
         }
         let column_x: Vec<f64> = (0..width).map(|column| anchors[column * per_cell].center_m[0]).collect();
         let row_y: Vec<f64> = (0..height).map(|row| anchors[row * width * per_cell].center_m[1]).collect();
@@ -98,10 +98,10 @@ impl TargetAssigner {
             anchor.center_m[0] == column_x[cell % width] && anchor.center_m[1] == row_y[cell / width]
         };
         if let Some(index) = anchors.iter().enumerate().position(|entry| !on_lattice(entry)) {
-            return Err(LatticeError::NotSeparable { index });
+            return Err(AnchorGridError::NotSeparable { index });
         }
         if !column_x.is_sorted_by(|a, b| a < b) || !row_y.is_sorted_by(|a, b| a < b) {
-            return Err(LatticeError::NotSeparable { index: 0 });
+            return Err(AnchorGridError::NotSeparable { index: 0 });
         }
         let standing: Vec<Standing> = anchors.iter().map(Standing::of).collect();
         let reach = anchors.iter().map(|anchor| anchor.size_m[0].hypot(anchor.size_m[1]) / 2.0).fold(0.0, f64::max);
@@ -231,7 +231,7 @@ mod tests {
 
     const CAR: [f64; 3] = [3.9, 1.6, 1.56];
 
-    fn lattice(height: usize, width: usize) -> Vec<Box3d> {
+    fn anchor_grid(height: usize, width: usize) -> Vec<Box3d> {
         let cell = |row: usize, column: usize| [column as f64 * 0.8, row as f64 * 0.8, -1.0];
         (0..height * width * 2)
             .map(|index| Box3d {
@@ -243,12 +243,12 @@ mod tests {
     }
 
     fn assigner() -> TargetAssigner {
-        TargetAssigner::new(lattice(20, 30), [20, 30, 2], TargetRule::default()).unwrap()
+        TargetAssigner::new(anchor_grid(20, 30), [20, 30, 2], TargetRule::default()).unwrap()
     }
 
     #[test]
     fn an_object_on_an_anchor_has_nothing_to_regress_there() {
-        let anchors = lattice(20, 30);
+        let anchors = anchor_grid(20, 30);
         let labels = assigner().assign(&[anchors[777]]);
         let at = labels.positives.iter().find(|positive| positive.anchor == 777).unwrap();
         assert!(at.code.iter().all(|value| value.abs() < 1e-12));
@@ -294,11 +294,11 @@ mod tests {
 
     #[test]
     fn anchors_off_a_grid_are_rejected() {
-        let mut anchors = lattice(4, 5);
+        let mut anchors = anchor_grid(4, 5);
         let error = TargetAssigner::new(anchors.clone(), [4, 4, 2], TargetRule::default()).unwrap_err();
-        assert!(matches!(error, LatticeError::Count { found: 40, .. }));
+        assert!(matches!(error, AnchorGridError::Count { found: 40, .. }));
         anchors[13].center_m[0] += 0.1;
         let error = TargetAssigner::new(anchors, [4, 5, 2], TargetRule::default()).unwrap_err();
-        assert_eq!(error, LatticeError::NotSeparable { index: 13 });
+        assert_eq!(error, AnchorGridError::NotSeparable { index: 13 });
     }
 }

@@ -176,8 +176,8 @@ impl V2vNet {
 impl Incoming {
     fn warp(&self, maps: &Tensor) -> Result<Tensor, TchError> {
         let theta = self.theta.f_to_kind(maps.kind())?;
-        let lattice = Tensor::f_affine_grid_generator(&theta, maps.size(), self.corners_aligned)?;
-        maps.f_grid_sampler(&lattice, BILINEAR, PADDING_ZEROS, self.corners_aligned)
+        let sampling_grid = Tensor::f_affine_grid_generator(&theta, maps.size(), self.corners_aligned)?;
+        maps.f_grid_sampler(&sampling_grid, BILINEAR, PADDING_ZEROS, self.corners_aligned)
     }
 
     /// Incoming maps of `receiver` from all, by the poses of their maps; `reach` is given for the ego and computed for
@@ -199,8 +199,8 @@ impl Incoming {
             None => {
                 let size = [nodes.len() as i64, 1, i64::from(grid.height), i64::from(grid.width)];
                 let everywhere = Tensor::f_ones(size, (Kind::Float, theta.device()))?;
-                let lattice = Tensor::f_affine_grid_generator(&theta, size, false)?;
-                everywhere.f_grid_sampler(&lattice, NEAREST, PADDING_ZEROS, false)?
+                let sampling_grid = Tensor::f_affine_grid_generator(&theta, size, false)?;
+                everywhere.f_grid_sampler(&sampling_grid, NEAREST, PADDING_ZEROS, false)?
             }
         };
         Ok(Self { theta, corners_aligned: false, mask })

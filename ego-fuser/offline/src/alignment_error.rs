@@ -23,7 +23,7 @@ use fusion::{MapMetadata, ReceivedMaps};
 
 /// Reason why nothing is measured.
 #[derive(Debug, thiserror::Error)]
-pub enum ResidualError {
+pub enum AlignmentMeterError {
     /// The weights are not readable.
     #[error(transparent)]
     Weights(#[from] WeightsError),
@@ -43,7 +43,7 @@ pub enum ResidualError {
     #[error(transparent)]
     Warp(#[from] WarpError),
     /// The tensor library reported an error.
-    #[error("residual: {0}")]
+    #[error("alignment error: {0}")]
     Torch(#[from] tch::TchError),
     /// The fusion has no alignment to measure.
     #[error("the fusion of these weights has no alignment of its own")]
@@ -61,7 +61,7 @@ pub struct Offset {
 
 /// Errors of relative poses before and after a method's own alignment.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Residual {
+pub struct AlignmentError {
     /// Offset added to true poses.
     pub offset: Offset,
     /// Pairs of vehicles.
@@ -76,7 +76,7 @@ pub struct Residual {
 
 /// Encoder and fusion of a weights file.
 #[derive(Debug)]
-pub struct ResidualMeter {
+pub struct AlignmentMeter {
     detector: Detector,
     fusion: FusionStage,
 }
@@ -87,12 +87,12 @@ struct Pair {
     ego_from_cav: Pose,
 }
 
-impl ResidualMeter {
+impl AlignmentMeter {
     /// Reads the weights.
     ///
     /// # Errors
-    /// [`ResidualError`] names the file and what is wrong with it.
-    pub fn load(weights: &Weights) -> Result<Self, ResidualError> {
+    /// [`AlignmentMeterError`] names the file and what is wrong with it.
+    pub fn load(weights: &Weights) -> Result<Self, AlignmentMeterError> {
         let method = weights.metadata(METHOD_KEY).unwrap_or(Method::NONE.name()).parse()?;
         let detector = Detector::from_weights(weights, &weights.config()?)?;
         let fusion = FusionStage::from_weights(weights, method, detector.config())?;
@@ -103,14 +103,14 @@ impl ResidualMeter {
     /// same seed.
     ///
     /// # Errors
-    /// [`ResidualError`] at the first frame that cannot be read, and when the fusion has no alignment of its own.
+    /// [`AlignmentMeterError`] at the first frame that cannot be read, and when the fusion has no alignment of its own.
     pub fn measure(
         &mut self,
         scenarios: &[Scenario],
         every: usize,
         offsets: &[Offset],
         seed: u64,
-    ) -> Result<Vec<Residual>, ResidualError> {
+    ) -> Result<Vec<AlignmentError>, AlignmentMeterError> {
         let mut errors: Vec<Vec<[[f64; 2]; 2]>> = offsets.iter().map(|_| Vec::new()).collect();
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         for scenario in scenarios {
@@ -126,7 +126,7 @@ impl ResidualMeter {
     }
 
     /// The ego with each of its neighbours in range.
-    fn pairs(&mut self, scenario: &Scenario, tick: usize) -> Result<Vec<Pair>, ResidualError> {
+    fn pairs(&mut self, scenario: &Scenario, tick: usize) -> Result<Vec<Pair>, AlignmentMeterError> {
         let ego = scenario.load(0, tick, &LoadOptions::default())?;
         let Some(world_from_ego) = ego.world_from_lidar else { return Ok(Vec::new()) };
         let own = self.map(&ego.points)?;
@@ -151,7 +151,7 @@ impl ResidualMeter {
     }
 
     /// Errors of a pair with an offset, before and after: metres and degrees.
-    fn around(&self, pair: &Pair, offset: &Offset, rng: &mut impl Rng) -> Result<[[f64; 2]; 2], ResidualError> {
+    fn around(&self, pair: &Pair, offset: &Offset, rng: &mut impl Rng) -> Result<[[f64; 2]; 2], AlignmentMeterError> {
         let (sin, cos) = rng.random_range(0.0..TAU).sin_cos();
         let turn_rad = offset.turn_deg.to_radians() * if rng.random_bool(0.5) { 1.0 } else { -1.0 };
         let off = moved(&pair.ego_from_cav, [offset.shift_m * cos, offset.shift_m * sin, turn_rad]);
@@ -160,7 +160,7 @@ impl ResidualMeter {
             let received = ReceivedMaps::new(pair.maps.shallow_clone(), None);
             self.fusion.fuse(&self.fusion.align(&received, &facts)?)
         })?;
-        let correction = fused.corrections.ok_or(ResidualError::NoAlignment)?;
+        let correction = fused.corrections.ok_or(AlignmentMeterError::NoAlignment)?;
         let values: Vec<f64> = Vec::try_from(correction.f_to_kind(Kind::Double)?.f_view([-1])?)?;
         let [dx, dy, theta] = [0, 1, 2].map(|index| values[index]);
         let corrected = moved(&off, [dx, dy, theta]);
@@ -181,11 +181,11 @@ fn error(truth: &Pose, found: &Pose) -> [f64; 2] {
     [dx.hypot(dy), turn_rad.abs().to_degrees()]
 }
 
-fn summary(offset: &Offset, errors: &[[[f64; 2]; 2]]) -> Residual {
+fn summary(offset: &Offset, errors: &[[[f64; 2]; 2]]) -> AlignmentError {
     let values = |moment: usize, which: usize| errors.iter().map(move |error| error[moment][which]);
     let mean = |moment, which| values(moment, which).sum::<f64>() / errors.len().max(1) as f64;
     let median = |moment| statistics::median(&values(moment, 0).collect::<Vec<_>>()).unwrap_or(0.0);
-    Residual {
+    AlignmentError {
         offset: *offset,
         pairs: errors.len(),
         mean_m: [mean(0, 0), mean(1, 0)],

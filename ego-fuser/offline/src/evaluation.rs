@@ -31,7 +31,7 @@ use protocol::message::{Detections, FusedNeighbour, SkippedNeighbour};
 use protocol::{Box3d, CavId, CodecConfig, Ledger, PoseEstimate, Stamp};
 
 use ego_fuser::ego::{Ego, EgoOutput, Skipped, View};
-use ego_fuser::misbehaviour::{MisbehaviourConfig, heard};
+use ego_fuser::misbehaviour::{MisbehaviourConfig, neighbour_states};
 use fusion::method::{Exchange, Method};
 use training::feature_store::MapSource;
 
@@ -116,7 +116,7 @@ impl Evaluator {
     /// # Errors
     /// [`EvaluateError`] names the file and what is wrong with it.
     pub fn new(config: EvaluateConfig) -> Result<Self, EvaluateError> {
-        let ego = Ego::load(&config.weights, config.method)?.with_trust(config.trust)?;
+        let ego = Ego::load(&config.weights, config.method)?.with_misbehaviour_detection(config.trust)?;
         let area = ego.detector().config();
         let rule = config
             .protocol
@@ -245,8 +245,8 @@ impl Evaluator {
         let rate = if is_ego { RateConfig::default() } else { own.map_or(self.config.rate, |own| own.rate) };
         let detector = Detector::from_weights(&self.weights, &self.weights.config()?)?;
         let place = scenario.agents.iter().position(|agent| agent == cav).unwrap_or(0);
-        let attack = match own.and_then(|own| own.lie) {
-            Some(lie) => Some(Attack::new(lie, cav, 0)),
+        let attack = match own.and_then(|own| own.falsification) {
+            Some(falsification) => Some(Attack::new(falsification, cav, 0)),
             None => self.config.attack.and_then(|attack| attack.of(place, cav)),
         };
         let agent = Agent::new(cav.clone(), source.for_scenario(&scenario.name).build()?, detector);
@@ -325,7 +325,7 @@ impl Evaluator {
             detections: output.detections,
             fused,
             skipped: skipped.collect(),
-            heard: heard(&output.beliefs, neighbours),
+            neighbours: neighbour_states(&output.beliefs, neighbours),
             stages: output.stages,
         }
     }

@@ -23,7 +23,7 @@ pub(crate) enum Command {
     /// Measure AP on recorded scenes
     Eval(Forwarded),
     /// Measure the part of pose offsets that a method's own alignment leaves
-    Residual(Forwarded),
+    AlignmentError(Forwarded),
     /// Run the fusing vehicle of a live fleet
     Run(Box<run::Arguments>),
     /// Train a method on scenes
@@ -42,7 +42,7 @@ impl Command {
             }
             Self::Align(forwarded) => offline(forwarded, "align")?,
             Self::Eval(forwarded) => offline(forwarded, "eval")?,
-            Self::Residual(forwarded) => offline(forwarded, "residual")?,
+            Self::AlignmentError(forwarded) => offline(forwarded, "alignment-error")?,
             Self::Train(forwarded) => offline(forwarded, "train")?,
         }
         Ok(Outcome::Done)

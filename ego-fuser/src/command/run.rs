@@ -29,7 +29,7 @@ impl Arguments {
         let cav = settings.id.as_ref().context("the configuration names no ego")?;
         models.threads.apply();
         let ego = Ego::load(&models.weights, *method).map_err(|error| BadInput::new(format!("weights: {error}")))?;
-        let ego = ego.with_comm_range(config.comm_range_m).with_trust(settings.trust())?;
+        let ego = ego.with_comm_range(config.comm_range_m).with_misbehaviour_detection(settings.trust())?;
         let stop = bus.stop().context("installing signal handlers")?;
         let bus = bus.join(run, Role::Ego, cav)?;
         tracing::info!(ego = %cav, method = %ego.method(), weights = %models.weights.display(), "ready");

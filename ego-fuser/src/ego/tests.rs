@@ -249,18 +249,18 @@ fn maps_of_another_network_are_left_out_and_named_where_they_are_the_egos_own() 
 
 #[test]
 fn codes_are_fused_as_the_maps_that_they_stand_for_and_no_others() {
-    let squeezed = |ratio| detector_with(Some(ratio));
-    let own = view_by(squeezed(4), "a", HERE, Method::MAX, 0.0);
-    let other = view_by(squeezed(4), "b", near(), Method::MAX, 0.1);
+    let compressed = |ratio| detector_with(Some(ratio));
+    let own = view_by(compressed(4), "a", HERE, Method::MAX, 0.0);
+    let other = view_by(compressed(4), "b", near(), Method::MAX, 0.1);
     let Content::Features(map) = &other.content else { panic!("max exchanges maps") };
     assert_eq!((map.features.channels, map.features.code_of), (16, Some(64)));
-    let mut ego = Ego::new(squeezed(4), Method::MAX).unwrap();
+    let mut ego = Ego::new(compressed(4), Method::MAX).unwrap();
     let together = ego.detect(&own, std::slice::from_ref(&other)).unwrap();
     assert_eq!(together.fused, [0]);
     // The same network without a compressor is given the decompressed maps.
     let widened = |view: &View| {
         let Content::Features(map) = &view.content else { panic!("max exchanges maps") };
-        let features = detector().to_message(&squeezed(4).received(map).unwrap()).unwrap();
+        let features = detector().to_message(&compressed(4).received(map).unwrap()).unwrap();
         View { content: Content::Features(DecodedFeatures { features, sent: None }), ..view.clone() }
     };
     let mut plain = Ego::new(detector(), Method::MAX).unwrap();
@@ -269,7 +269,7 @@ fn codes_are_fused_as_the_maps_that_they_stand_for_and_no_others() {
     let mut of_another = other.clone();
     let Content::Features(map) = &mut of_another.content else { panic!("max exchanges maps") };
     map.features.code_of = Some(128);
-    let strangers = [of_another, widened(&other), view_by(squeezed(8), "b", near(), Method::MAX, 0.1)];
+    let strangers = [of_another, widened(&other), view_by(compressed(8), "b", near(), Method::MAX, 0.1)];
     let skipped = ego.detect(&own, &strangers).unwrap().skipped;
     assert_eq!(skipped, [0, 1, 2].map(|index| (index, Skipped::Unusable(DropReason::Shape))));
 }

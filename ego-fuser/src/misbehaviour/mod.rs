@@ -14,7 +14,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use nalgebra::Isometry2;
 use perception::detector::{Detector, DetectorError};
-use protocol::message::HeardNeighbour;
+use protocol::message::NeighbourState;
 use protocol::{CavId, MisbehaviourReason, PointCloud, Pose};
 use serde::{Deserialize, Serialize};
 
@@ -81,26 +81,26 @@ pub struct Assessment {
     /// Probability that it is honest, 0..1.
     pub trust: f64,
     /// Reason for which it is left out; absent: it is fused.
-    pub doubt: Option<MisbehaviourReason>,
+    pub misbehaviour: Option<MisbehaviourReason>,
 }
 
 impl Assessment {
     /// True if it is left out.
     #[must_use]
     pub fn is_out(&self) -> bool {
-        self.doubt.is_some()
+        self.misbehaviour.is_some()
     }
 }
 
 /// Report of the assessed neighbours, without clock data; `assessments` are the `beliefs` of an `EgoOutput`.
 #[must_use]
-pub fn heard(assessments: &[(usize, Assessment)], views: &[View]) -> Vec<HeardNeighbour> {
+pub fn neighbour_states(assessments: &[(usize, Assessment)], views: &[View]) -> Vec<NeighbourState> {
     let of = |(index, view): (usize, &View)| {
         let assessment = assessments.iter().find(|(known, _)| *known == index).map(|(_, assessment)| assessment);
-        HeardNeighbour {
+        NeighbourState {
             cav: view.cav.clone(),
             trust: assessment.map(|assessment| assessment.trust),
-            doubt: assessment.and_then(|assessment| assessment.doubt),
+            misbehaviour: assessment.and_then(|assessment| assessment.misbehaviour),
             clock_offset_s: None,
         }
     };
@@ -207,7 +207,7 @@ impl MisbehaviourDetector {
         let MisbehaviourConfig { leave_out_below, take_back_above } = self.config;
         if self.peers.len() >= MAX_PEERS && !self.peers.contains_key(cav) {
             // Beyond the limit of neighbours nothing is known.
-            return Assessment { trust: 0.5, doubt: probation.then_some(MisbehaviourReason::Probation) };
+            return Assessment { trust: 0.5, misbehaviour: probation.then_some(MisbehaviourReason::Probation) };
         }
         let reputation = self.peers.entry(cav.clone()).or_insert(Reputation {
             log_odds: 0.0,
@@ -231,7 +231,10 @@ impl MisbehaviourDetector {
             (true, false) => tracing::info!(%cav, "its messages agree with the ego's perception: readmitted"),
             _ => {}
         }
-        Assessment { trust: 1.0 / (1.0 + (-reputation.log_odds).exp()), doubt: reputation.is_out.then_some(reason) }
+        Assessment {
+            trust: 1.0 / (1.0 + (-reputation.log_odds).exp()),
+            misbehaviour: reputation.is_out.then_some(reason),
+        }
     }
 }
 
@@ -278,7 +281,11 @@ mod tests {
             trust.add_up(0, &cav, log_odds.map(|odds| (odds, MisbehaviourReason::Duplicated)), false)
         };
         assert!(!assess(None).is_out(), "left out only with evidence");
-        assert_eq!(assess(Some(-3.0)).doubt, Some(MisbehaviourReason::Duplicated), "strong evidence counts at once");
+        assert_eq!(
+            assess(Some(-3.0)).misbehaviour,
+            Some(MisbehaviourReason::Duplicated),
+            "strong evidence counts at once"
+        );
         assert!(assess(None).is_out(), "the same message is no new evidence");
         let returns = (0..20).position(|_| !assess(Some(1.5)).is_out()).unwrap();
         assert!((1..6).contains(&returns), "after {returns} frames");
@@ -291,7 +298,7 @@ mod tests {
     fn boxes_are_accepted_with_evidence_in_their_favour() {
         let mut trust = trust();
         let cav = CavId::new("a").unwrap();
-        assert_eq!(trust.add_up(0, &cav, None, true).doubt, Some(MisbehaviourReason::Probation));
+        assert_eq!(trust.add_up(0, &cav, None, true).misbehaviour, Some(MisbehaviourReason::Probation));
         assert!(!trust.add_up(0, &cav, Some((2.0, MisbehaviourReason::PositionMismatch)), true).is_out());
         assert!(!trust.add_up(0, &cav, None, true).is_out());
     }

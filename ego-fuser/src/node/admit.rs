@@ -21,18 +21,18 @@ impl Node<'_> {
             return self.admit_descriptor(cav, arrival);
         }
         if *cav != self.cav && self.models.is_other(cav) {
-            return self.bus.books().dropped(&arrival.topic, DropReason::Shape);
+            return self.bus.stats().dropped(&arrival.topic, DropReason::Shape);
         }
         if let Some(reason) = self.out_of_time(arrival).filter(|_| *cav != self.cav) {
-            return self.bus.books().dropped(&arrival.topic, reason);
+            return self.bus.stats().dropped(&arrival.topic, reason);
         }
         let began = Instant::now();
         let Some((pose, content)) = self.decode(arrival) else { return };
-        self.bus.books().timed("decode", began.elapsed());
+        self.bus.stats().timed("decode", began.elapsed());
         let transport = Duration::from_nanos(unix_nanos().saturating_sub(arrival.header.stamp.publish_nanos));
         // Decoding, which lies between arrival and now, is part of the wait.
         let transport = transport.saturating_sub(arrival.at.elapsed());
-        self.bus.books().timed(&format!("{} transport", self.stream), transport);
+        self.bus.stats().timed(&format!("{} transport", self.stream), transport);
         let capture_nanos = arrival.header.stamp.capture_nanos;
         let view = View { cav: cav.clone(), pose, capture_nanos, content };
         if *cav == self.cav {
@@ -47,7 +47,7 @@ impl Node<'_> {
         let payload_bytes = u64::from(arrival.header.metadata_len) + arrival.header.body_len;
         let wire_bytes = payload_bytes + HEADER_LEN as u64 + pose_message_bytes(&arrival.header.stamp, pose);
         if let Some(lost) = self.pairing.insert(cav, capture_nanos, Received { view, payload_bytes, wire_bytes }) {
-            self.bus.books().dropped(&arrival.topic, lost.reason);
+            self.bus.stats().dropped(&arrival.topic, lost.reason);
         }
     }
 
@@ -73,7 +73,7 @@ impl Node<'_> {
             tracing::info!(capture_nanos, "the scene has restarted");
             for cav in self.pairing.cavs() {
                 for _ in 0..self.pairing.turn_back(&cav, capture_nanos, MAX_AHEAD_NANOS) {
-                    self.bus.books().dropped(&self.topic(&cav), DropReason::Stale);
+                    self.bus.stats().dropped(&self.topic(&cav), DropReason::Stale);
                 }
             }
             self.ego.forget();
@@ -91,7 +91,7 @@ impl Node<'_> {
         }
         tracing::warn!(%cav, "its maps are of another network and are left out: {other}");
         for _ in 0..self.pairing.forget(cav) {
-            self.bus.books().dropped(&self.topic(cav), DropReason::Shape);
+            self.bus.stats().dropped(&self.topic(cav), DropReason::Shape);
         }
     }
 
@@ -114,7 +114,7 @@ impl Node<'_> {
                 match decoded {
                     Ok(features) => Some((pose, Content::Features(features))),
                     Err(error) => {
-                        self.bus.books().rejected(&arrival.topic, &error);
+                        self.bus.stats().rejected(&arrival.topic, &error);
                         None
                     }
                 }

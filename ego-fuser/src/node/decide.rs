@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use bus::unix_nanos;
-use protocol::message::{DetectionsReport, FusedNeighbour, HeardNeighbour, SkippedNeighbour, StageTiming};
+use protocol::message::{DetectionsReport, FusedNeighbour, NeighbourState, SkippedNeighbour, StageTiming};
 use protocol::{Body, CavId, Detections, DropReason, Encoded, wire};
 
 use super::{Node, OwnFrame};
@@ -62,8 +62,8 @@ impl Node<'_> {
         let own_topic = self.topic(&self.cav);
         match self.ego.detect(&own, &choice.views) {
             Ok(EgoOutput { detections, fused, skipped, beliefs, stages }) => {
-                let heard = self.neighbour_reports(&beliefs, &choice.views);
-                self.bus.books().received(&own_topic);
+                let neighbours = self.neighbour_reports(&beliefs, &choice.views);
+                self.bus.stats().received(&own_topic);
                 self.leave_out(&skipped, &mut choice);
                 let fused = self.take_in(&own, &fused, &choice);
                 let before = [StageTiming::new("transport", transport), StageTiming::new("wait", waited)];
@@ -76,7 +76,7 @@ impl Node<'_> {
                     detections,
                     fused,
                     skipped: choice.skipped,
-                    heard,
+                    neighbours,
                     stages,
                 };
                 self.publish(capture_nanos, result);
@@ -84,7 +84,7 @@ impl Node<'_> {
             Err(error) => {
                 tracing::error!(capture_nanos, "a frame could not be fused: {error}");
                 self.report.failed += 1;
-                self.bus.books().dropped(&own_topic, DropReason::Shape);
+                self.bus.stats().dropped(&own_topic, DropReason::Shape);
                 // The neighbours' messages are valid.
                 self.take_in(&own, &(0..choice.views.len()).collect::<Vec<_>>(), &choice);
             }
@@ -92,15 +92,15 @@ impl Node<'_> {
     }
 
     /// Report of the neighbours received for a frame.
-    fn neighbour_reports(&self, assessments: &[(usize, Assessment)], views: &[View]) -> Vec<HeardNeighbour> {
-        let stats = self.bus.books();
+    fn neighbour_reports(&self, assessments: &[(usize, Assessment)], views: &[View]) -> Vec<NeighbourState> {
+        let stats = self.bus.stats();
         for (index, assessment) in assessments {
             stats.trusted(&views[*index].cav, assessment.trust);
         }
         let clocks = stats.peers();
         let clock = |cav: &CavId| clocks.iter().find(|peer| peer.cav == *cav)?.clock_offset_s;
-        let reports = misbehaviour::heard(assessments, views).into_iter();
-        reports.map(|neighbour| HeardNeighbour { clock_offset_s: clock(&neighbour.cav), ..neighbour }).collect()
+        let reports = misbehaviour::neighbour_states(assessments, views).into_iter();
+        reports.map(|neighbour| NeighbourState { clock_offset_s: clock(&neighbour.cav), ..neighbour }).collect()
     }
 
     /// The neighbours' messages for a frame, and the neighbours without one.
@@ -114,7 +114,7 @@ impl Node<'_> {
             choice.messages.push(MessageInfo { is_first_use, payload_bytes, wire_bytes });
         }
         for lost in &dropped {
-            self.bus.books().dropped(&self.topic(&lost.cav), lost.reason);
+            self.bus.stats().dropped(&self.topic(&lost.cav), lost.reason);
         }
         let Some(neighbourhood) = &mut self.neighbourhood else { return choice };
         let has_sent = |cav: &&CavId| choice.views.iter().any(|view| view.cav == **cav);
@@ -163,27 +163,27 @@ impl Node<'_> {
         let topic = self.topic(cav);
         match reason {
             _ if !is_first_use => {}
-            Some(reason) => self.bus.books().dropped(&topic, reason),
-            None => self.bus.books().received(&topic),
+            Some(reason) => self.bus.stats().dropped(&topic, reason),
+            None => self.bus.stats().received(&topic),
         }
     }
 
     fn publish(&mut self, capture_nanos: u64, result: Detections) {
         // The own message's transport is counted already.
         for stage in result.stages.iter().filter(|stage| stage.stage != "transport") {
-            self.bus.books().timed(&stage.stage, Duration::from_nanos(stage.nanos));
+            self.bus.stats().timed(&stage.stage, Duration::from_nanos(stage.nanos));
         }
         self.report.frames += 1;
         // The ego does not know when the sensors of its vehicle measured.
-        self.bus.books().answered(None, result.fused.len());
+        self.bus.stats().answered(None, result.fused.len());
         let (fused, binary) = (unix_nanos(), result.clone());
-        self.detections.offer_encoded(capture_nanos, move |stamp| {
+        self.detections.submit_encoded(capture_nanos, move |stamp| {
             let mut result = binary;
             let sending = Duration::from_nanos(stamp.publish_nanos.saturating_sub(fused));
             result.stages.push(StageTiming::new("send", sending));
             wire::encode(stamp, result)
         });
-        self.json.offer_encoded(capture_nanos, move |stamp| {
+        self.json.submit_encoded(capture_nanos, move |stamp| {
             let head = DetectionsReport::new(stamp, None, result).to_json().into_bytes();
             Ok(Encoded { head, body: Body::Empty })
         });

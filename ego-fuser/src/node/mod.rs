@@ -227,7 +227,7 @@ impl<'a> Node<'a> {
         // Messages that wait for a frame that will not come.
         let (_, dropped) = self.pairing.pair(u64::MAX);
         for lost in dropped {
-            self.bus.books().dropped(&self.topic(&lost.cav), lost.reason);
+            self.bus.stats().dropped(&self.topic(&lost.cav), lost.reason);
         }
         Ok(())
     }
@@ -252,7 +252,7 @@ impl<'a> Node<'a> {
             self.models.forget(&cav);
             self.ended.remove(&cav);
             for _ in 0..self.pairing.forget(&cav) {
-                self.bus.books().dropped(&topic, DropReason::Stale);
+                self.bus.stats().dropped(&topic, DropReason::Stale);
             }
         }
         Ok(())

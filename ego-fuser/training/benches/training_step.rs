@@ -63,7 +63,7 @@ fn training_step(criterion: &mut Criterion) {
         let assigner = model.assigner().expect("lean has anchors");
         let labels: Vec<_> = (0..SAMPLES).map(|_| assigner.assign(&objects(&mut rng))).collect();
         let labels = LabelTensors::gather(&labels, Unassigned::Ignored, Device::Cpu);
-        let batch = PillarBatch::new(&pillars.iter().collect::<Vec<_>>(), model.network().lattice());
+        let batch = PillarBatch::new(&pillars.iter().collect::<Vec<_>>(), model.network().pillar_grid());
         group.bench_function(name, |bencher| {
             bencher.iter(|| {
                 let output = model.forward(&batch, &facts, true).expect("views and facts add up");

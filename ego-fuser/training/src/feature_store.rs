@@ -25,7 +25,7 @@ use tch::{TchError, Tensor};
 /// Digits of each hash in the name of a file.
 const HASH_DIGITS: usize = 12;
 /// zstd level of a message: more costs time and saves nothing.
-const PACKING: i32 = 1;
+const ZSTD_LEVEL: i32 = 1;
 
 /// Error of storing or reading maps.
 #[derive(Debug, thiserror::Error)]
@@ -177,7 +177,7 @@ impl FeatureStore {
     }
 
     fn packed(&self, features: BevFeatures) -> Result<Vec<u8>, FeatureStoreError> {
-        let codec = CodecConfig { dtype: self.dtype, zstd_level: Some(PACKING), ..CodecConfig::default() };
+        let codec = CodecConfig { dtype: self.dtype, zstd_level: Some(ZSTD_LEVEL), ..CodecConfig::default() };
         // Sender and time of a map follow from its index.
         let cav = CavId::new("0").map_err(|_| self.io(io::ErrorKind::InvalidInput.into()))?;
         let stamp = Stamp { cav, epoch: 0, sequence: 0, capture_nanos: 0, publish_nanos: 0 };

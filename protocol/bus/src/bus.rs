@@ -87,7 +87,7 @@ impl Bus {
 
     /// Its ledger and stage timings.
     #[must_use]
-    pub fn books(&self) -> &MessageStats {
+    pub fn stats(&self) -> &MessageStats {
         &self.stats
     }
 
@@ -164,7 +164,7 @@ impl Bus {
     }
 
     /// Publishes `control` without waiting.
-    pub fn say(&self, control: Control, capture_nanos: u64) {
+    pub fn publish_control(&self, control: Control, capture_nanos: u64) {
         self.status.publish(control, capture_nanos);
     }
 

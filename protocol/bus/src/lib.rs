@@ -63,7 +63,7 @@ pub use process_config::{Configured, ProcessConfig, minimal};
 pub use process_usage::{process_cpu_s, process_usage};
 pub use publisher::{Overflow, Publisher, PublisherOptions, unix_nanos};
 pub use readiness::{Barrier, NotReady, Route, RouteError, RoutesReady, process_id};
-pub use rejection_log::{Rejection, RejectionLog, STRANGER};
+pub use rejection_log::{Rejection, RejectionLog, UNAUTHORISED};
 pub use session::{BusOptions, Role as SessionRole, open};
 pub use subscriber::{Arrival, Event, Inbox, Subscription};
 pub use watchdog::Heartbeat;

@@ -58,14 +58,14 @@ pub fn present(session: &Session, run: &RunId) -> Result<BTreeSet<ProcessId>, Bu
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum LivelinessEvent {
     /// The process is alive, possibly since long before the subscription.
-    Appeared {
+    Joined {
         /// Role of the process.
         role: Role,
         /// Vehicle of the process.
         cav: CavId,
     },
     /// The process is gone.
-    Vanished {
+    Left {
         /// Role of the process.
         role: Role,
         /// Vehicle of the process.
@@ -96,8 +96,8 @@ impl LivelinessSubscription {
                 // Tokens outside this key grammar are ignored.
                 if let Ok(Key { topic: Topic::Alive { role, cav }, .. }) = sample.key_expr().as_str().parse() {
                     report(match sample.kind() {
-                        SampleKind::Put => LivelinessEvent::Appeared { role, cav },
-                        SampleKind::Delete => LivelinessEvent::Vanished { role, cav },
+                        SampleKind::Put => LivelinessEvent::Joined { role, cav },
+                        SampleKind::Delete => LivelinessEvent::Left { role, cav },
                     });
                 }
             });

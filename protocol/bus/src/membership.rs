@@ -27,8 +27,8 @@ impl Membership {
             let events = Arc::clone(&events);
             move |event| {
                 let (cav, is_there) = match event {
-                    LivelinessEvent::Appeared { cav, .. } => (cav, true),
-                    LivelinessEvent::Vanished { cav, .. } => (cav, false),
+                    LivelinessEvent::Joined { cav, .. } => (cav, true),
+                    LivelinessEvent::Left { cav, .. } => (cav, false),
                 };
                 if let PushOutcome::NoLane(_) = events.push(cav.clone(), is_there) {
                     tracing::warn!(%cav, "more processes join and leave than can be tracked");

@@ -102,7 +102,7 @@ impl MessageStats {
     }
 
     /// Counts one more message submitted on `topic`.
-    pub fn offered(&self, topic: &Topic) {
+    pub fn submitted(&self, topic: &Topic) {
         self.note(topic, |state| state.ledger.sent(&Account::published(topic.clone())));
     }
 
@@ -112,7 +112,7 @@ impl MessageStats {
     }
 
     /// Counts a submitted message as suppressed.
-    pub fn withheld(&self, topic: &Topic, reason: DropReason) {
+    pub fn suppressed(&self, topic: &Topic, reason: DropReason) {
         self.note(topic, |state| state.ledger.dropped(&Account::published(topic.clone()), reason));
     }
 
@@ -370,9 +370,9 @@ mod tests {
         let (agent, ego) = (stats_of("agent-4279"), stats_of("ego-4279"));
         ego.subscribed(&topic());
         for _ in 0..5 {
-            agent.offered(&topic());
+            agent.submitted(&topic());
         }
-        agent.withheld(&topic(), DropReason::Superseded);
+        agent.suppressed(&topic(), DropReason::Superseded);
         agent.delivered(&topic());
         agent.delivered(&topic());
         ego.arrived(&topic());
@@ -391,7 +391,7 @@ mod tests {
     fn repeated_messages_are_not_counted() {
         let agent = stats_of("agent-4279");
         let topic: Topic = "4279/descriptor".parse().unwrap();
-        agent.offered(&topic);
+        agent.submitted(&topic);
         agent.delivered(&topic);
         agent.rejected(&topic, &WireError::Kind { expected: protocol::Kind::Descriptor, found: protocol::Kind::Bev });
         assert!(agent.ledger().is_empty());

@@ -204,7 +204,7 @@ mod tests {
         stats.received(&lidar);
         stats.received(&lidar);
         stats.dropped(&lidar, DropReason::Superseded);
-        stats.offered(&bev);
+        stats.submitted(&bev);
         stats.trusted(&cav, 0.25);
         stats.published(&bev, 1_500);
         stats.published(&bev, 500);

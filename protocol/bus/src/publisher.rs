@@ -29,7 +29,7 @@ const SMALL_BYTES: usize = 16 << 10;
 pub enum Overflow {
     /// Bounded queue of this length, KEEP_LAST: the newest message replaces the oldest, which is counted as superseded.
     /// For data that are measured periodically.
-    KeepNewest(usize),
+    KeepLast(usize),
     /// Bounded queue of this length; the producer waits when it is full. For messages that must not be lost, and for
     /// paced runs.
     Wait(usize),
@@ -63,7 +63,7 @@ impl PublisherOptions {
     pub const PREVIEW: Self = Self { is_for_onlookers: true, ..Self::new(Priority::Background, false) };
 
     const fn new(priority: Priority, express: bool) -> Self {
-        Self { overflow: Overflow::KeepNewest(1), priority, express, is_for_onlookers: false }
+        Self { overflow: Overflow::KeepLast(1), priority, express, is_for_onlookers: false }
     }
 
     /// The same, but the producer waits and no message is dropped.
@@ -75,7 +75,7 @@ impl PublisherOptions {
 
 type Encode = Box<dyn FnOnce(&Stamp) -> Result<ZBytes, WireError> + Send>;
 
-struct Offer {
+struct Submission {
     capture_nanos: u64,
     encode: Encode,
 }
@@ -86,13 +86,13 @@ struct Offer {
 /// every message that takes longer than 50 ms. As a consequence `put` waits for the network, for seconds on a slow one,
 /// so neither a clock nor a network thread nor an async task may call it.
 ///
-/// With [`Overflow::KeepNewest`] the next large message is taken only when the router has the previous one: `put`
+/// With [`Overflow::KeepLast`] the next large message is taken only when the router has the previous one: `put`
 /// returns as soon as a message is in the buffers of zenoh and of the system, which hold a megabyte, and feature maps
 /// would become stale there on a slow link.
 pub struct Publisher {
     topic: Topic,
     overflow: Overflow,
-    queue: Arc<BoundedQueue<(), Offer>>,
+    queue: Arc<BoundedQueue<(), Submission>>,
     stats: MessageStats,
     /// True while there are subscribers; only for droppable topics.
     has_subscribers: Option<Arc<AtomicBool>>,
@@ -122,7 +122,7 @@ impl Publisher {
             .wait()
             .map_err(|cause| BusError::zenoh(format!("declaring a publisher on {key}"), &cause))?;
         let places = match overflow {
-            Overflow::KeepNewest(places) | Overflow::Wait(places) => places,
+            Overflow::KeepLast(places) | Overflow::Wait(places) => places,
         };
         let has_subscribers = is_for_onlookers.then(|| has_subscribers(&publisher)).transpose();
         let has_subscribers =
@@ -138,7 +138,7 @@ impl Publisher {
             stats: stats.clone(),
             publisher,
             receipt: FlushBarrier::new(session, &key.run, priority),
-            is_one_at_a_time: matches!(overflow, Overflow::KeepNewest(_)) && !is_for_onlookers,
+            is_one_at_a_time: matches!(overflow, Overflow::KeepLast(_)) && !is_for_onlookers,
         };
         let thread = thread::Builder::new()
             .name(format!("send {topic}"))
@@ -161,23 +161,23 @@ impl Publisher {
 
     /// Submits a message captured at `capture_nanos`. Returns at once, except under [`Overflow::Wait`] with a full
     /// queue.
-    pub fn offer<M: Payload + Send + 'static>(&self, capture_nanos: u64, message: M) {
-        self.offer_encoded(capture_nanos, move |stamp| wire::encode(stamp, message));
+    pub fn submit<M: Payload + Send + 'static>(&self, capture_nanos: u64, message: M) {
+        self.submit_encoded(capture_nanos, move |stamp| wire::encode(stamp, message));
     }
 
     /// Submits a message that `encode` makes from its stamp on the sending thread.
-    pub fn offer_encoded(
+    pub fn submit_encoded(
         &self,
         capture_nanos: u64,
         encode: impl FnOnce(&Stamp) -> Result<Encoded, WireError> + Send + 'static,
     ) {
-        self.push(Offer { capture_nanos, encode: Box::new(|stamp| encode(stamp).map(payload)) });
+        self.push(Submission { capture_nanos, encode: Box::new(|stamp| encode(stamp).map(payload)) });
     }
 
     /// Forwards a message unchanged, under the stamp of its sender; nothing is copied.
     pub fn relay(&self, arrival: &Arrival) {
         let bytes = arrival.payload().clone();
-        self.push(Offer { capture_nanos: arrival.header.stamp.capture_nanos, encode: Box::new(|_| Ok(bytes)) });
+        self.push(Submission { capture_nanos: arrival.header.stamp.capture_nanos, encode: Box::new(|_| Ok(bytes)) });
     }
 
     /// The same with another capture time, that of an erroneous clock.
@@ -192,19 +192,19 @@ impl Publisher {
         writer.append(header.to_bytes().to_vec().into());
         writer.append(rest.into());
         let bytes = writer.finish();
-        self.push(Offer { capture_nanos, encode: Box::new(|_| Ok(bytes)) });
+        self.push(Submission { capture_nanos, encode: Box::new(|_| Ok(bytes)) });
     }
 
-    fn push(&self, offer: Offer) {
-        self.stats.offered(&self.topic);
+    fn push(&self, submission: Submission) {
+        self.stats.submitted(&self.topic);
         let pushed = match self.overflow {
-            Overflow::KeepNewest(_) => self.queue.push((), offer),
-            Overflow::Wait(_) => self.queue.push_waiting((), offer),
+            Overflow::KeepLast(_) => self.queue.push((), submission),
+            Overflow::Wait(_) => self.queue.push_waiting((), submission),
         };
         match pushed {
             PushOutcome::Queued => {}
             PushOutcome::Replaced(_) | PushOutcome::NoLane(_) | PushOutcome::Closed(_) => {
-                self.stats.withheld(&self.topic, DropReason::Superseded);
+                self.stats.suppressed(&self.topic, DropReason::Superseded);
             }
         }
     }
@@ -234,7 +234,7 @@ struct Sender {
     epoch: u64,
     sequence: u64,
     has_notifications: bool,
-    queue: Arc<BoundedQueue<(), Offer>>,
+    queue: Arc<BoundedQueue<(), Submission>>,
     stats: MessageStats,
     publisher: zenoh::pubsub::Publisher<'static>,
     receipt: FlushBarrier,
@@ -251,7 +251,7 @@ impl Sender {
         loop {
             let probing = self.has_notifications && self.sequence == 0;
             match self.queue.take(probing.then(|| Instant::now() + PROBE_PERIOD)) {
-                Pop::Item((), offer) => self.send(offer),
+                Pop::Item((), submission) => self.send(submission),
                 Pop::TimedOut => self.notify(Control::Probe),
                 Pop::Closed => break,
             }
@@ -262,7 +262,7 @@ impl Sender {
         }
     }
 
-    fn send(&mut self, Offer { capture_nanos, encode }: Offer) {
+    fn send(&mut self, Submission { capture_nanos, encode }: Submission) {
         let began = Instant::now();
         match encode(&self.stamp(capture_nanos)) {
             Ok(bytes) => {
@@ -278,12 +278,12 @@ impl Sender {
                     }
                 } else {
                     // The session is closed: there is no transport.
-                    self.stats.withheld(&self.topic, DropReason::PeerOffline);
+                    self.stats.suppressed(&self.topic, DropReason::PeerOffline);
                 }
             }
             Err(error) => {
                 tracing::error!(topic = %self.topic, capture_nanos, "message cannot be sent: {error}");
-                self.stats.withheld(&self.topic, error.drop_reason());
+                self.stats.suppressed(&self.topic, error.drop_reason());
             }
         }
     }
@@ -362,7 +362,7 @@ mod tests {
         session.close().wait().unwrap();
         let source = GnssSource::Recorded;
         let gnss = Gnss { world_from_lidar: Pose::IDENTITY, position_std_m: 0.0, heading_std_rad: 0.0, source };
-        publisher.offer(5, gnss);
+        publisher.submit(5, gnss);
         publisher.finish();
         let lost = Counts { sent: 1, dropped: [(DropReason::PeerOffline, 1)].into(), ..Counts::default() };
         assert_eq!(stats.ledger().get(&Account::published(key.topic)), Some(&lost));

@@ -133,9 +133,9 @@ impl Barrier {
             let (Topic::Ready(sender), Event::Message(arrival)) = (&topic, event) else { continue };
             match inbox.decode(&arrival, &Limits::DEFAULT) {
                 // A process may confirm its own routes only.
-                Some(Control::Ready { process, heard }) if process == *sender => {
-                    for topic in heard {
-                        self.heard(&Route { topic, receiver: sender.clone() });
+                Some(Control::Ready { process, subscribed }) if process == *sender => {
+                    for topic in subscribed {
+                        self.confirm(&Route { topic, receiver: sender.clone() });
                     }
                 }
                 Some(_) => inbox.reject_invalid(&topic, "not the sender's own readiness"),
@@ -145,7 +145,7 @@ impl Barrier {
     }
 
     /// Marks `route` as confirmed. Routes that are not expected change nothing.
-    pub fn heard(&self, route: &Route) {
+    pub fn confirm(&self, route: &Route) {
         if self.lock().remove(route) {
             self.changed.notify_all();
         }
@@ -239,14 +239,14 @@ mod tests {
     #[test]
     fn opens_when_all_routes_are_confirmed() {
         let barrier = Barrier::new([route("1/lidar>a"), route("2/lidar>b")]);
-        barrier.heard(&route("1/lidar>a"));
-        barrier.heard(&route("3/lidar>c"));
+        barrier.confirm(&route("1/lidar>a"));
+        barrier.confirm(&route("3/lidar>c"));
         let error = barrier.wait(Duration::from_millis(5)).unwrap_err();
         assert_eq!(error.missing, [route("2/lidar>b")]);
         assert!(error.to_string().contains("2/lidar>b"), "{error}");
         std::thread::scope(|scope| {
             let waiting = scope.spawn(|| barrier.wait(Duration::from_secs(60)));
-            barrier.heard(&route("2/lidar>b"));
+            barrier.confirm(&route("2/lidar>b"));
             assert_eq!(waiting.join().unwrap(), Ok(()));
         });
     }

@@ -15,12 +15,12 @@ const QUERY_TIMEOUT: Duration = Duration::from_secs(1);
 const MAX_REJECTIONS: usize = 1024;
 
 /// Name of peers that are not authenticated.
-pub const STRANGER: &str = "stranger";
+pub const UNAUTHORISED: &str = "unauthorised";
 
 /// Rejection of a message or of a connection by a router.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Rejection {
-    /// Common name of the certificate, or the session's id without one; [`STRANGER`] for peers that are not admitted.
+    /// Common name of the certificate, or the session's id without one; [`UNAUTHORISED`] for peers that are not admitted.
     pub peer: String,
     /// `access-control`, `low-pass` or `handshake`.
     pub reason: String,
@@ -80,7 +80,7 @@ impl RejectionLog {
             *counts.entry(rejection.clone()).or_default() += count;
         }
         counts.extend(self.failed_handshakes.iter().map(|(cause, count)| {
-            let [peer, reason, message] = [STRANGER, "handshake", *cause].map(str::to_owned);
+            let [peer, reason, message] = [UNAUTHORISED, "handshake", *cause].map(str::to_owned);
             (Rejection { peer, reason, message }, *count)
         }));
         counts

@@ -141,12 +141,12 @@ impl StatusSender {
     fn ready(&self, shared: &Shared, sequence: &mut u64) {
         // Cleared first: a probe that arrives from here on requests a new answer.
         shared.answer_due.store(false, Ordering::Release);
-        let heard: Vec<Topic> =
+        let subscribed: Vec<Topic> =
             shared.confirmed.lock().unwrap_or_else(PoisonError::into_inner).iter().cloned().collect();
-        if !heard.is_empty() {
+        if !subscribed.is_empty() {
             let process = self.stats.process().clone();
             let key = Key::ready(&self.run, &process);
-            self.put(&key, Priority::InteractiveHigh, 0, Control::Ready { process, heard }, sequence);
+            self.put(&key, Priority::InteractiveHigh, 0, Control::Ready { process, subscribed }, sequence);
         }
     }
 

@@ -95,7 +95,7 @@ pub struct Codec {
     /// Selection of the cells.
     pub selection: Selection,
     /// Compression of the body.
-    pub packing: Compression,
+    pub compression: Compression,
 }
 
 /// A feature map as it is transmitted.
@@ -143,7 +143,7 @@ pub fn encode_features(
     confidence: Option<&[f32]>,
 ) -> Result<EncodedFeatures, WireError> {
     let BevFeatures { grid, channels, .. } = features;
-    let dense = Codec { dtype: config.dtype, selection: Selection::Dense, packing: Compression::Raw };
+    let dense = Codec { dtype: config.dtype, selection: Selection::Dense, compression: Compression::Raw };
     let layout = Layout::new(&grid, channels, &dense, &Limits::SENDER)?;
     let expected = layout.cells * channels as usize;
     let found = features.values.len();
@@ -188,7 +188,7 @@ fn encode_selected(
     };
     let packed = zstd_level.map(|level| compression::pack(body.as_bytes(), level)).transpose()?.flatten();
     let (codec, body) = match packed {
-        Some(packed) => (Codec { packing: Compression::Zstd, ..codec }, Body::Bytes(packed)),
+        Some(packed) => (Codec { compression: Compression::Zstd, ..codec }, Body::Bytes(packed)),
         None => (codec, body),
     };
     Ok(EncodedFeatures { grid, channels, code_of, codec, rate: None, body })
@@ -225,7 +225,7 @@ impl EncodedFeatures {
         limits: &Limits,
     ) -> Result<BodyShape, WireError> {
         let layout = Layout::new(grid, channels, codec, limits)?;
-        Ok(match (codec.packing, codec.dtype, codec.selection) {
+        Ok(match (codec.compression, codec.dtype, codec.selection) {
             (Compression::Raw, Dtype::F32, Selection::Dense) => BodyShape::Floats((layout.values.len() / 4) as u64),
             (Compression::Raw, ..) => BodyShape::Bytes { min: layout.len() as u64, max: layout.len() as u64 },
             // A body that compression does not make smaller is sent uncompressed.
@@ -264,7 +264,7 @@ impl EncodedFeatures {
         let body = match (body, codec) {
             (
                 Body::Floats(values),
-                Codec { dtype: Dtype::F32, selection: Selection::Dense, packing: Compression::Raw },
+                Codec { dtype: Dtype::F32, selection: Selection::Dense, compression: Compression::Raw },
             ) => {
                 let (expected, found) = (layout.values.len() as u64 / 4, values.len() as u64);
                 if expected != found {
@@ -274,7 +274,7 @@ impl EncodedFeatures {
             }
             (body, _) => body,
         };
-        let raw = unpack(body, codec.packing, layout.len())?;
+        let raw = unpack(body, codec.compression, layout.len())?;
         let values =
             dtype::read(codec.dtype, &raw[layout.scales.clone()], &raw[layout.values.clone()], layout.selected)?;
         check_values("feature", &values, limits.max_abs_value)?;
@@ -292,12 +292,12 @@ impl EncodedFeatures {
 }
 
 /// The unpacked body, of exactly `expected` bytes.
-fn unpack(body: Body, packing: Compression, expected: usize) -> Result<Vec<u8>, WireError> {
+fn unpack(body: Body, compression: Compression, expected: usize) -> Result<Vec<u8>, WireError> {
     let bytes = match body {
         Body::Bytes(bytes) => bytes,
         other => other.as_bytes().to_vec(),
     };
-    let bytes = match packing {
+    let bytes = match compression {
         Compression::Raw => bytes,
         Compression::Zstd => compression::unpack(bytes, expected)?,
     };
@@ -322,9 +322,9 @@ mod tests {
         let config = CodecConfig { zstd_level: Some(3), ..CodecConfig::default() };
         let noise: Vec<f32> = (1..=8u8).map(|n| f32::from(n).sin()).collect();
         let encoded = encode_features(map(noise.clone()), &config, None).unwrap();
-        assert_eq!((encoded.codec.packing, encoded.body), (Compression::Raw, Body::Floats(noise)));
+        assert_eq!((encoded.codec.compression, encoded.body), (Compression::Raw, Body::Floats(noise)));
         let encoded = encode_features(map(vec![0.1; 800]), &config, None).unwrap();
-        assert_eq!(encoded.codec.packing, Compression::Zstd);
+        assert_eq!(encoded.codec.compression, Compression::Zstd);
         assert!(encoded.body.len() < 100);
     }
 

@@ -151,7 +151,7 @@ fn wanted(features: &BevFeatures, config: &CodecConfig, confidence: Option<&[f32
 }
 
 fn body_bytes(features: &BevFeatures, dtype: Dtype, selection: Selection) -> Result<u64, WireError> {
-    let codec = Codec { dtype, selection, packing: Compression::Raw };
+    let codec = Codec { dtype, selection, compression: Compression::Raw };
     Ok(Layout::new(&features.grid, features.channels, &codec, &Limits::SENDER)?.len() as u64)
 }
 

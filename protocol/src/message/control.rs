@@ -44,7 +44,7 @@ pub enum Control {
         /// Process that is ready.
         process: ProcessId,
         /// Routes over which a [`Control::Probe`] has arrived.
-        heard: Vec<Topic>,
+        subscribed: Vec<Topic>,
     },
     /// On a data key before the first message: confirms the route. Answered by [`Control::Ready`] with the topic.
     Probe,
@@ -87,7 +87,7 @@ impl Control {
         match self {
             Self::Start { rate } => check_within("rate", *rate, 0.0, 1e6),
             Self::End { sent, .. } => check_count("topics", sent.len(), limits.max_entries),
-            Self::Ready { heard, .. } => check_count("topics", heard.len(), limits.max_entries),
+            Self::Ready { subscribed, .. } => check_count("topics", subscribed.len(), limits.max_entries),
             Self::Pause | Self::Resume | Self::Step { .. } | Self::Seek { .. } | Self::Probe | Self::Done { .. } => {
                 Ok(())
             }

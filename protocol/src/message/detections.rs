@@ -33,7 +33,7 @@ pub struct Detections {
     /// Neighbours whose data were not fused.
     pub skipped: Vec<SkippedNeighbour>,
     /// Misbehaviour detection and clock offset of each neighbour that sent data for this frame.
-    pub heard: Vec<HeardNeighbour>,
+    pub neighbours: Vec<NeighbourState>,
     /// Durations of the stages.
     pub stages: Vec<StageTiming>,
 }
@@ -65,13 +65,13 @@ pub struct SkippedNeighbour {
 
 /// State of a neighbour at the ego.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct HeardNeighbour {
+pub struct NeighbourState {
     /// Id of the neighbour.
     pub cav: CavId,
     /// Trust score (probability of being honest), 0..=1; `None` without misbehaviour detection.
     pub trust: Option<f64>,
     /// Misbehaviour reason, if it is excluded.
-    pub doubt: Option<MisbehaviourReason>,
+    pub misbehaviour: Option<MisbehaviourReason>,
     /// Its clock minus the ego's, minus the shortest transit time of its messages, seconds; `None` if both share one
     /// clock.
     pub clock_offset_s: Option<f64>,
@@ -88,8 +88,8 @@ impl Detections {
             check_within("confidence", neighbour.confidence.into(), 0.0, 1.0)?;
             check_nanos("age_nanos", neighbour.age_nanos.unsigned_abs())?;
         }
-        check_count("heard neighbours", self.heard.len(), limits.max_entries)?;
-        for neighbour in &self.heard {
+        check_count("neighbours", self.neighbours.len(), limits.max_entries)?;
+        for neighbour in &self.neighbours {
             check_within("trust", neighbour.trust.unwrap_or(0.0), 0.0, 1.0)?;
             // The clock of an attacker may be wrong by any amount.
             check_within("clock offset", neighbour.clock_offset_s.unwrap_or(0.0), -1e11, 1e11)?;

@@ -28,7 +28,7 @@ pub use bev::{Bev, BevMetadata};
 pub use boxes::Boxes;
 pub use control::{Control, TopicCount};
 pub use descriptor::{Descriptor, ModelHash};
-pub use detections::{Detections, DetectionsReport, FusedNeighbour, HeardNeighbour, SkippedNeighbour};
+pub use detections::{Detections, DetectionsReport, FusedNeighbour, NeighbourState, SkippedNeighbour};
 pub use gnss::{Gnss, GnssSource};
 pub use pose_estimate::{NoPoseReason, PoseEstimate};
 pub use stats::{ProcessUsage, StageSummary, StageTiming, Stats, TopicTraffic};

@@ -132,10 +132,11 @@ fn any_detections() -> impl Strategy<Value = Detections> {
     );
     let skipped = (any_cav(), option::of(select(DropReason::ALL.to_vec())))
         .prop_map(|(cav, reason)| SkippedNeighbour { cav, reason });
-    let doubt = option::of(select(MisbehaviourReason::ALL.to_vec()));
-    let heard = (any_cav(), option::of(0.0..=1.0f64), doubt, option::of(-1e9..1e9f64))
-        .prop_map(|(cav, trust, doubt, clock_offset_s)| HeardNeighbour { cav, trust, doubt, clock_offset_s });
-    let neighbours = (vec(fused, 0..4), vec(skipped, 0..4), vec(heard, 0..4));
+    let misbehaviour = option::of(select(MisbehaviourReason::ALL.to_vec()));
+    let states = (any_cav(), option::of(0.0..=1.0f64), misbehaviour, option::of(-1e9..1e9f64)).prop_map(
+        |(cav, trust, misbehaviour, clock_offset_s)| NeighbourState { cav, trust, misbehaviour, clock_offset_s },
+    );
+    let neighbours = (vec(fused, 0..4), vec(skipped, 0..4), vec(states, 0..4));
     let lists = (vec(any_detection(), 0..20), neighbours, vec(any_timing(), 0..4));
     (any_cav(), any::<u64>(), "[a-z]{1,10}", any_estimate(), lists).prop_map(
         |(ego, agent_frame, method, pose, (detections, (fused, skipped, heard), stages))| Detections {
@@ -146,7 +147,7 @@ fn any_detections() -> impl Strategy<Value = Detections> {
             detections,
             fused,
             skipped,
-            heard,
+            neighbours,
             stages,
         },
     )
@@ -181,7 +182,8 @@ fn any_control() -> impl Strategy<Value = Control> {
         any::<u64>().prop_map(|ticks| Control::Step { ticks }),
         any::<u64>().prop_map(|tick| Control::Seek { tick }),
         (any::<u64>(), vec(sent, 0..6)).prop_map(|(ticks, sent)| Control::End { ticks, sent }),
-        (any_process(), vec(any_topic(), 0..6)).prop_map(|(process, heard)| Control::Ready { process, heard }),
+        (any_process(), vec(any_topic(), 0..6))
+            .prop_map(|(process, subscribed)| Control::Ready { process, subscribed }),
         (any_process(), any::<u64>()).prop_map(|(process, tick)| Control::Done { process, tick }),
     ]
 }

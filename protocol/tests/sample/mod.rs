@@ -107,12 +107,12 @@ pub(crate) fn detections() -> Detections {
             SkippedNeighbour { cav: cav("-1"), reason: None },
             SkippedNeighbour { cav: cav("7"), reason: Some(DropReason::Stale) },
         ],
-        heard: vec![
-            HeardNeighbour { cav: cav("4288"), trust: Some(0.75), doubt: None, clock_offset_s: Some(-0.002) },
-            HeardNeighbour {
+        neighbours: vec![
+            NeighbourState { cav: cav("4288"), trust: Some(0.75), misbehaviour: None, clock_offset_s: Some(-0.002) },
+            NeighbourState {
                 cav: cav("7"),
                 trust: Some(0.0),
-                doubt: Some(MisbehaviourReason::Duplicated),
+                misbehaviour: Some(MisbehaviourReason::Duplicated),
                 clock_offset_s: None,
             },
         ],
@@ -187,7 +187,7 @@ pub(crate) fn every_kind() -> Vec<Message> {
         Control::Step { ticks: 2 },
         Control::Seek { tick: 5 },
         Control::End { ticks: 100, sent: vec![TopicCount { topic: topic.clone(), messages: 100 }] },
-        Control::Ready { process: process.clone(), heard: vec![topic] },
+        Control::Ready { process: process.clone(), subscribed: vec![topic] },
         Control::Probe,
         Control::Done { process, tick: 4 },
     ];

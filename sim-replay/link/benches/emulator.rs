@@ -28,7 +28,7 @@ use zenoh::qos::CongestionControl;
 const CHANNELS: usize = 64;
 const ROUNDS: usize = 40;
 const WARM_UP: usize = 5;
-const PATIENCE: Duration = Duration::from_secs(10);
+const TIMEOUT: Duration = Duration::from_secs(10);
 
 type Failure = Box<dyn std::error::Error>;
 
@@ -46,7 +46,7 @@ fn raw(publisher: &Publisher, arrivals: &Receiver<ZBytes>, values: Vec<f32>) -> 
     let payload = bytes::Bytes::from_owner(protocol::Body::Floats(values));
     let begin = Instant::now();
     publisher.put(payload).wait().map_err(|cause| cause.to_string())?;
-    let arrived = arrivals.recv_timeout(PATIENCE)?;
+    let arrived = arrivals.recv_timeout(TIMEOUT)?;
     let in_callback = begin.elapsed();
     let together = arrived.to_bytes();
     let time = begin.elapsed();
@@ -65,7 +65,7 @@ fn message(publisher: &Publisher, arrivals: &Receiver<ZBytes>, features: BevFeat
     writer.append(encoded.head.into());
     writer.append(bytes::Bytes::from_owner(encoded.body).into());
     publisher.put(writer.finish()).wait().map_err(|cause| cause.to_string())?;
-    let arrived = arrivals.recv_timeout(PATIENCE)?;
+    let arrived = arrivals.recv_timeout(TIMEOUT)?;
     let (_, bev) = wire::decode::<Bev>(arrived.slices(), &Limits::DEFAULT)?;
     let decoded = bev.features.decode(&Limits::DEFAULT)?;
     let time = begin.elapsed();
@@ -107,7 +107,7 @@ fn measure(route: &str, sender: &Session, receiver: &Session) -> Result<(), Fail
     let subscriber = subscriber.wait().map_err(|cause| cause.to_string())?;
     let publisher = sender.declare_publisher("v2v/bench/4279/bev").congestion_control(CongestionControl::Block);
     let publisher = publisher.wait().map_err(|cause| cause.to_string())?;
-    let deadline = Instant::now() + PATIENCE;
+    let deadline = Instant::now() + TIMEOUT;
     while !publisher.matching_status().wait().map_err(|cause| cause.to_string())?.matching() {
         assert!(Instant::now() < deadline, "no route between two sessions of one process");
         std::thread::yield_now();

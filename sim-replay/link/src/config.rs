@@ -131,14 +131,14 @@ pub struct QueueConfig {
     /// Message that is dropped if the queue is full.
     pub drop: QueueDrop,
     /// True if a newer message of the same stream replaces one that waits.
-    pub keep_newest: bool,
+    pub keep_last: bool,
     /// Messages of at most this many bytes do not wait behind larger ones.
     pub urgent_bytes: u64,
 }
 
 impl Default for QueueConfig {
     fn default() -> Self {
-        Self { bytes: 16 << 20, drop: QueueDrop::Tail, keep_newest: false, urgent_bytes: FRAGMENT_BYTES }
+        Self { bytes: 16 << 20, drop: QueueDrop::Tail, keep_last: false, urgent_bytes: FRAGMENT_BYTES }
     }
 }
 
@@ -406,7 +406,7 @@ mod tests {
     #[test]
     fn a_file_names_every_stage() {
         let text = "medium: shared\ncapacity: {token_bucket: {rate_mbps: 27, burst_bytes: 3000}}\n\
-            queue: {bytes: 100000, drop: head, keep_newest: true}\ndelay: {normal: {mean_ms: 10, std_ms: 3}}\n\
+            queue: {bytes: 100000, drop: head, keep_last: true}\ndelay: {normal: {mean_ms: 10, std_ms: 3}}\n\
             loss: {gilbert_elliott: {to_bad: 0.01, to_good: 0.2}}\nloss_unit: fragment\n\
             reorder: {probability: 0.01, extra_ms: 30}\nduplicate: 0.001\noutages: [{from_s: 3, to_s: 13}]\n\
             clock: {offset_ms: -20, drift_ppm: 50, step: {at_s: 3, by_ms: 200}}\n";

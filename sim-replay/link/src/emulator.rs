@@ -32,7 +32,7 @@ pub struct Packet {
     /// Bytes on the wire, headers included.
     pub bytes: u64,
     /// Time at which it is submitted, nanoseconds since the beginning of the scene.
-    pub offered_nanos: u64,
+    pub submitted_nanos: u64,
     /// Distance between sender and receiver at that time, metres.
     pub distance_m: f64,
 }
@@ -57,9 +57,9 @@ pub struct Outcome {
     /// Time of the arrival or of the loss, nanoseconds since the beginning of the scene.
     pub nanos: u64,
     /// The packet.
-    pub parcel: Packet,
+    pub packet: Packet,
     /// Its result.
-    pub fate: Delivery,
+    pub delivery: Delivery,
 }
 
 /// Link emulator: packets in, outcomes out, in order of time.
@@ -93,7 +93,7 @@ struct UnderWay {
     nanos: u64,
     number: u64,
     packet: Packet,
-    fate: Delivery,
+    delivery: Delivery,
 }
 
 impl PartialEq for UnderWay {
@@ -155,16 +155,16 @@ impl LinkEmulator {
     }
 
     /// Submits a packet. Time never goes back: a packet earlier than the last one counts as submitted with it.
-    pub fn offer(&mut self, mut packet: Packet) {
-        packet.offered_nanos = packet.offered_nanos.max(self.now_nanos);
-        self.run(packet.offered_nanos);
+    pub fn submit(&mut self, mut packet: Packet) {
+        packet.submitted_nanos = packet.submitted_nanos.max(self.now_nanos);
+        self.run(packet.submitted_nanos);
         let key = match self.config.medium {
             Medium::Shared => None,
             Medium::PerPair => Some((packet.from.clone(), packet.to.clone())),
         };
         let mut left = Vec::new();
         let rules = rules(&self.config, &self.capacity);
-        self.lines.entry(key).or_default().offer(packet, &rules, &mut left);
+        self.lines.entry(key).or_default().submit(packet, &rules, &mut left);
         left.into_iter().for_each(|left| self.settle(left));
         self.collect(self.now_nanos);
     }
@@ -204,8 +204,8 @@ impl LinkEmulator {
 
     fn collect(&mut self, until_nanos: u64) {
         while self.under_way.peek().is_some_and(|Reverse(under_way)| under_way.nanos <= until_nanos) {
-            let Some(Reverse(UnderWay { nanos, packet, fate, .. })) = self.under_way.pop() else { return };
-            self.outcomes.push(Outcome { nanos, parcel: packet, fate });
+            let Some(Reverse(UnderWay { nanos, packet, delivery, .. })) = self.under_way.pop() else { return };
+            self.outcomes.push(Outcome { nanos, packet, delivery });
         }
     }
 
@@ -235,7 +235,7 @@ impl LinkEmulator {
         }
         let delay_nanos = config.delay.draw(&mut random(Purpose::Delay), trace.as_ref(), &message);
         // No packet arrives before its last bit was sent, also with rounding.
-        let arrival_nanos = config.floored(packet.offered_nanos, end_nanos.saturating_add(delay_nanos));
+        let arrival_nanos = config.floored(packet.submitted_nanos, end_nanos.saturating_add(delay_nanos));
         let mut arrival_nanos = arrival_nanos.max(end_nanos);
         if config.keep_order {
             let latest = direction.latest_nanos.entry(packet.stream).or_default();
@@ -258,8 +258,8 @@ impl LinkEmulator {
         self.schedule(arrival_nanos, packet, Delivery::Arrived { is_copy: false, is_repeated: false });
     }
 
-    fn schedule(&mut self, nanos: u64, packet: Packet, fate: Delivery) {
-        self.under_way.push(Reverse(UnderWay { nanos, number: self.next, packet, fate }));
+    fn schedule(&mut self, nanos: u64, packet: Packet, delivery: Delivery) {
+        self.under_way.push(Reverse(UnderWay { nanos, number: self.next, packet, delivery }));
         self.next += 1;
     }
 }
@@ -271,12 +271,12 @@ impl LinkConfig {
         self.outages.iter().any(|outage| start_nanos < nanos(outage.to_s) && end_nanos >= nanos(outage.from_s))
     }
 
-    /// Rounds the time since `offered_nanos` down to whole steps, if the link has them.
-    fn floored(&self, offered_nanos: u64, arrival_nanos: u64) -> u64 {
-        let took_nanos = arrival_nanos.saturating_sub(offered_nanos);
+    /// Rounds the time since `submitted_nanos` down to whole steps, if the link has them.
+    fn floored(&self, submitted_nanos: u64, arrival_nanos: u64) -> u64 {
+        let took_nanos = arrival_nanos.saturating_sub(submitted_nanos);
         match nanos::of_ms(self.floor_ms) {
             0 => arrival_nanos,
-            step_nanos => offered_nanos + took_nanos / step_nanos * step_nanos,
+            step_nanos => submitted_nanos + took_nanos / step_nanos * step_nanos,
         }
     }
 }

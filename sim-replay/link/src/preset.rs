@@ -47,7 +47,7 @@ impl LinkConfig {
     /// [`LinkError::Preset`] lists the available names.
     pub fn preset(name: &str) -> Result<Self, LinkError> {
         let shaped = |rate_mbps: f64, burst_bytes| CapacityConfig::TokenBucket { rate_mbps, burst_bytes };
-        let radio = QueueConfig { bytes: 1 << 20, keep_newest: true, ..QueueConfig::default() };
+        let radio = QueueConfig { bytes: 1 << 20, keep_last: true, ..QueueConfig::default() };
         Ok(match name {
             "ideal" => Self::default(),
             // OpenCOOD's `wild_setting`, async_mode `sim`: async_overhead 100 ms.

@@ -48,8 +48,8 @@ pub(super) struct Rules<'a> {
 
 impl QueueServer {
     /// Submits a packet now. The queue has been advanced to now.
-    pub(super) fn offer(&mut self, packet: Packet, rules: &Rules<'_>, left: &mut Vec<Departure>) {
-        let nanos = packet.offered_nanos;
+    pub(super) fn submit(&mut self, packet: Packet, rules: &Rules<'_>, left: &mut Vec<Departure>) {
+        let nanos = packet.submitted_nanos;
         if *rules.capacity == Capacity::Unlimited {
             left.push(Departure::Sent { packet, start_nanos: nanos, end_nanos: nanos });
             return;
@@ -62,7 +62,7 @@ impl QueueServer {
             self.cut_in(packet, rules);
             return;
         }
-        if rules.queue.keep_newest {
+        if rules.queue.keep_last {
             self.supersede(&packet, left);
         }
         let is_full = |line: &Self| line.waiting_bytes.saturating_add(packet.bytes) > rules.queue.bytes;
@@ -117,7 +117,7 @@ impl QueueServer {
 
     /// Inserts an urgent packet: the end of the packet being sent is delayed by its duration.
     fn cut_in(&mut self, packet: Packet, rules: &Rules<'_>) {
-        let nanos = packet.offered_nanos;
+        let nanos = packet.submitted_nanos;
         let added = work(packet.bytes);
         self.urgent_used = self.urgent_used.max(rules.capacity.done_by(nanos)) + added;
         self.used += added;
@@ -132,7 +132,7 @@ impl QueueServer {
         while let Some(place) = self.waiting.iter().position(is_same) {
             let Some(older) = self.waiting.remove(place) else { return };
             self.waiting_bytes -= older.bytes;
-            let nanos = newer.offered_nanos;
+            let nanos = newer.submitted_nanos;
             left.push(Departure::Dropped { packet: older, reason: DropReason::Superseded, nanos });
         }
     }

@@ -14,7 +14,7 @@ pub(super) const MESSAGE_HEAD: usize = 22;
 /// Length of the record that ends the data.
 pub(super) const DATA_END_LEN: usize = 4;
 /// Supported compressions of chunks.
-const PACKINGS: [&[u8]; 3] = [b"", b"zstd", b"lz4"];
+const COMPRESSIONS: [&[u8]; 3] = [b"", b"zstd", b"lz4"];
 
 /// Checks the lengths in a chunk, a schema or a channel. The records of a compressed chunk are checked when they are
 /// unpacked.
@@ -58,10 +58,10 @@ pub(super) fn is_filled(opcode: u8, record: &[u8]) -> bool {
 
 /// True if a chunk of `len` bytes begins here: its compression is known, and its records fill the rest.
 pub(super) fn is_chunk_head(bytes: &[u8], len: u64) -> bool {
-    let Some((packing, rest)) = bytes.get(CHUNK_HEAD..).and_then(text) else { return false };
+    let Some((compression, rest)) = bytes.get(CHUNK_HEAD..).and_then(text) else { return false };
     let Some((&records_len, _)) = rest.split_first_chunk() else { return false };
-    let head_len = (CHUNK_HEAD + 4 + packing.len() + 8) as u64;
-    PACKINGS.contains(&packing) && u64::from_le_bytes(records_len).checked_add(head_len) == Some(len)
+    let head_len = (CHUNK_HEAD + 4 + compression.len() + 8) as u64;
+    COMPRESSIONS.contains(&compression) && u64::from_le_bytes(records_len).checked_add(head_len) == Some(len)
 }
 
 /// The channel of a message, and its payload.

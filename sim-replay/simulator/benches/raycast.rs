@@ -10,7 +10,7 @@ use simulator::generate::lidar::{LIDAR_MOUNT_M, Lidar};
 use simulator::generate::raycast::{Body, BodyShape, Placement, Sweep};
 use simulator::generate::vehicle::Vehicle;
 use simulator::generate::{Weather, ground_surface};
-use simulator::map::{Town, TownSource, build};
+use simulator::map::{MapModel, RoadMapSource, build};
 use support::random::SplitMix64;
 
 /// Vehicles on lanes around the sensor, one every this many metres of lane.
@@ -18,13 +18,13 @@ const SPACING_M: f64 = 20.0;
 const RANGE_M: f64 = 120.0;
 
 /// The lane and the position on it of the sensor.
-fn sensor_motion(town: &Town) -> Sweep {
+fn sensor_motion(map_model: &MapModel) -> Sweep {
     let center = |lane: &&simulator::map::Lane| {
         let [x, y, _] = lane.at(0.5 * lane.length_m).0;
         x.hypot(y)
     };
-    let roads = town.lanes.lanes.iter().filter(|lane| !lane.in_junction && lane.length_m > 30.0);
-    let lane = roads.min_by(|a, b| center(a).total_cmp(&center(b))).expect("the town has a road");
+    let roads = map_model.lanes.lanes.iter().filter(|lane| !lane.in_junction && lane.length_m > 30.0);
+    let lane = roads.min_by(|a, b| center(a).total_cmp(&center(b))).expect("the map_model has a road");
     let at = |s_m: f64| {
         let (position, heading) = lane.at(s_m);
         Placement::level(position, heading)
@@ -33,10 +33,10 @@ fn sensor_motion(town: &Town) -> Sweep {
     Sweep { start: at(15.0), end: at(15.6) }.mounted(LIDAR_MOUNT_M)
 }
 
-fn vehicles(town: &Town, around: &Placement) -> Vec<(Vehicle, Sweep)> {
+fn vehicles(map_model: &MapModel, around: &Placement) -> Vec<(Vehicle, Sweep)> {
     let mut random = SplitMix64::new(1);
     let mut vehicles = Vec::new();
-    for lane in &town.lanes.lanes {
+    for lane in &map_model.lanes.lanes {
         let mut s_m = 5.0;
         while s_m < lane.length_m - 5.0 {
             let (position, heading) = lane.at(s_m);
@@ -52,10 +52,10 @@ fn vehicles(town: &Town, around: &Placement) -> Vec<(Vehicle, Sweep)> {
     vehicles
 }
 
-fn bench_town(criterion: &mut Criterion, name: &str, source: &TownSource) {
-    let town = build(source, 0).expect("procedural towns always build");
-    let sensor = sensor_motion(&town);
-    let ground = ground_surface(&town);
+fn bench_map(criterion: &mut Criterion, name: &str, source: &RoadMapSource) {
+    let map_model = build(source, 0).expect("procedural towns always build");
+    let sensor = sensor_motion(&map_model);
+    let ground = ground_surface(&map_model);
     let standing: Vec<(BodyShape, Placement)> = town
         .solids
         .iter()
@@ -65,7 +65,7 @@ fn bench_town(criterion: &mut Criterion, name: &str, source: &TownSource) {
             distance < RANGE_M + shape.bounds.radius_m()
         })
         .collect();
-    let vehicles = vehicles(&town, &sensor.end);
+    let vehicles = vehicles(&map_model, &sensor.end);
     let moving = vehicles.iter().map(|(vehicle, motion)| Body { shape: &vehicle.shape, motion: *motion });
     let bodies: Vec<Body<'_>> =
         moving.chain(standing.iter().map(|(shape, place)| Body { shape, motion: Sweep::still(*place) })).collect();
@@ -82,8 +82,8 @@ fn bench_town(criterion: &mut Criterion, name: &str, source: &TownSource) {
 }
 
 fn sweeps(criterion: &mut Criterion) {
-    bench_town(criterion, "town1", &TownSource::Town1);
-    bench_town(criterion, "town4", &TownSource::Town4);
+    bench_map(criterion, "town1", &RoadMapSource::Town1);
+    bench_map(criterion, "town4", &RoadMapSource::Town4);
 }
 
 criterion_group! {

@@ -51,9 +51,9 @@ fn print(report: &LinkReport, as_json: bool) -> anyhow::Result<()> {
         output::line(serde_json::to_string(report)?)?;
         return Ok(());
     }
-    let LinkReport { offered, arrived, copies, under_way, longest_ms, dropped } = report;
+    let LinkReport { submitted, arrived, copies, under_way, longest_ms, dropped } = report;
     output::line(format_args!(
-        "{offered} messages: {arrived} arrived, {copies} of them twice, {under_way} still in flight"
+        "{submitted} messages: {arrived} arrived, {copies} of them twice, {under_way} still in flight"
     ))?;
     for (reason, count) in dropped {
         output::line(format_args!("{count} dropped: {reason}"))?;
@@ -62,7 +62,7 @@ fn print(report: &LinkReport, as_json: bool) -> anyhow::Result<()> {
     if !report.is_complete() {
         let seconds = *longest_ms as f64 * 1e-3;
         output::line(format_args!(
-            "{under_way} of {offered} messages were still in flight at the end, the oldest for {seconds:.1} s"
+            "{under_way} of {submitted} messages were still in flight at the end, the oldest for {seconds:.1} s"
         ))?;
     }
     Ok(())

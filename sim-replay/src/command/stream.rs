@@ -7,7 +7,7 @@ use bus::{Configured, STOP_LIMIT, log_to_stderr};
 use dataset::{self, OpenOptions, Scenario};
 use protocol::{CavId, DropReason, Role};
 use sim_replay::config::{ReplayConfig, SceneConfig};
-use sim_replay::stream::{AirReport, Replay, StreamError, StreamReport};
+use sim_replay::stream::{Replay, SensorLinkReport, StreamError, StreamReport};
 use support::output;
 
 use support::cli::Outcome;
@@ -98,8 +98,11 @@ fn print(report: &StreamReport, as_json: bool) -> anyhow::Result<()> {
         "late by p50 {:.1} ms, p95 {:.1} ms, at most {:.1} ms; {} ticks over 5 ms",
         lateness.p50_ms, lateness.p95_ms, lateness.max_ms, lateness.late_ticks
     ))?;
-    if let Some(AirReport { offered, arrived, dropped }) = &report.air {
-        output::line(format_args!("{offered} sensor frames crossed a link: {arrived} arrived{}", by_reason(dropped)))?;
+    if let Some(SensorLinkReport { submitted, arrived, dropped }) = &report.sensor_link {
+        output::line(format_args!(
+            "{submitted} sensor frames crossed a link: {arrived} arrived{}",
+            by_reason(dropped)
+        ))?;
     }
     if report.absent_frames > 0 {
         output::line(format_args!(

@@ -7,7 +7,7 @@ use std::path::PathBuf;
 use std::time::Instant;
 
 use simulator::generate::{self, SceneLayout, Subset, Summary, SynthError, SynthOptions, Weather};
-use simulator::map::TownSource;
+use simulator::map::RoadMapSource;
 use support::output;
 use support::progress;
 
@@ -34,11 +34,11 @@ pub(crate) struct Args {
     #[arg(long, value_enum, default_value_t)]
     layout: SceneLayout,
     /// town1, town4 or an OpenDRIVE map (.xodr). By default that of the subset; v2vdet takes both in turn.
-    #[arg(long, value_parser = parse_town)]
-    town: Option<TownSource>,
+    #[arg(long, value_parser = parse_map)]
+    map: Option<RoadMapSource>,
     /// Determines roads, buildings, trees and signs.
     #[arg(long, default_value_t = 0)]
-    town_seed: u64,
+    map_seed: u64,
     /// Scenarios of town1loc and town4loc, each another drive through the map.
     #[arg(long, default_value_t = 1)]
     traversals: usize,
@@ -88,7 +88,7 @@ pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
             print(&summary, &options, start.elapsed().as_secs_f64(), json)?;
             Ok(Outcome::Done)
         }
-        Err(error @ (SynthError::Write { .. } | SynthError::Alone { .. })) => Err(error.into()),
+        Err(error @ (SynthError::Write { .. } | SynthError::TooFewCompanions { .. })) => Err(error.into()),
         Err(error) => {
             output::note(format_args!("error: {error}"));
             Ok(Outcome::BadInput)
@@ -99,8 +99,8 @@ pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
 fn options(args: Args) -> SynthOptions {
     SynthOptions {
         layout: args.layout,
-        town: args.town,
-        town_seed: args.town_seed,
+        map: args.map,
+        map_seed: args.map_seed,
         traversals: args.traversals,
         scenes: args.scenes,
         agents: args.agents,
@@ -151,11 +151,11 @@ pub(super) fn print_omitted(omitted: &BTreeMap<&'static str, u64>) -> io::Result
     omitted.iter().try_for_each(|(what, count)| output::line(format_args!("not in this layout: {count} {what}")))
 }
 
-fn parse_town(text: &str) -> Result<TownSource, String> {
+fn parse_map(text: &str) -> Result<RoadMapSource, String> {
     match text {
-        "town1" => Ok(TownSource::Town1),
-        "town4" => Ok(TownSource::Town4),
-        path if path.to_lowercase().ends_with(".xodr") => Ok(TownSource::OpenDrive(path.into())),
+        "town1" => Ok(RoadMapSource::Town1),
+        "town4" => Ok(RoadMapSource::Town4),
+        path if path.to_lowercase().ends_with(".xodr") => Ok(RoadMapSource::OpenDrive(path.into())),
         _ => Err("expected town1, town4 or a file that ends in .xodr".into()),
     }
 }
@@ -180,9 +180,9 @@ mod tests {
     }
 
     #[test]
-    fn towns_are_names_or_maps() {
-        assert_eq!(parse_town("town4"), Ok(TownSource::Town4));
-        assert_eq!(parse_town("a/Town01.xodr"), Ok(TownSource::OpenDrive("a/Town01.xodr".into())));
-        assert!(parse_town("town2").is_err());
+    fn maps_are_names_or_maps() {
+        assert_eq!(parse_map("town4"), Ok(RoadMapSource::Town4));
+        assert_eq!(parse_map("a/Town01.xodr"), Ok(RoadMapSource::OpenDrive("a/Town01.xodr".into())));
+        assert!(parse_map("town2").is_err());
     }
 }

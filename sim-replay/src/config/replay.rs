@@ -25,7 +25,7 @@ pub struct ReplayConfig {
     /// file exists.
     #[arg(long, value_name = "FILE")]
     #[serde(default)]
-    pub bookmark: Option<PathBuf>,
+    pub checkpoint: Option<PathBuf>,
     /// Recorded scene.
     #[command(flatten)]
     pub scene: SceneConfig,
@@ -152,11 +152,11 @@ impl ReplayConfig {
             load: LoadOptions { lidar_variant: scene.variant.clone(), points: true, radar: scene.radar },
             await_agents: wait.await_agents,
             expect: wait.expect.clone(),
-            patience: seconds(wait.ready_timeout_s),
+            timeout: seconds(wait.ready_timeout_s),
             lockstep: if scene.lockstep { wait.egos.clone() } else { Vec::new() },
-            answer_patience: seconds(wait.answer_timeout_s),
+            answer_timeout: seconds(wait.answer_timeout_s),
             link: self.sensor_link.stages().map(|link| (link, self.sensor_link.seed)),
-            bookmark: self.bookmark.clone(),
+            checkpoint: self.checkpoint.clone(),
         }
     }
 }

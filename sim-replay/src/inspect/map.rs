@@ -5,7 +5,7 @@ use std::path::Path;
 
 use serde::Serialize;
 
-use simulator::map::{Finding, Map, TownError, read_map};
+use simulator::map::{Finding, Map, RoadMapError, read_map};
 
 /// Contents of an OpenDRIVE map. Serializes to the JSON of `sim-replay inspect --json MAP.xodr`, prints as its table.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -39,8 +39,8 @@ pub struct MapReport {
 /// Reads an OpenDRIVE map.
 ///
 /// # Errors
-/// [`TownError`] if the file cannot be read or is no usable map.
-pub fn inspect_map(path: &Path) -> Result<MapReport, TownError> {
+/// [`RoadMapError`] if the file cannot be read or is no usable map.
+pub fn inspect_map(path: &Path) -> Result<MapReport, RoadMapError> {
     let Map { network, lanes } = read_map(path)?;
     let roads = &network.roads;
     let heights = || lanes.lanes.iter().flat_map(|lane| &lane.centerline).map(|point| point[2]);

@@ -38,18 +38,18 @@ impl Place {
     /// The state left by the previous process instance in a scenario of `ticks` ticks; `None` if there was none.
     ///
     /// # Errors
-    /// [`BookmarkError`] if the file holds no state, or that of another scene.
-    pub fn read(path: &Path, scenario: &str, ticks: usize) -> Result<Option<Self>, BookmarkError> {
+    /// [`CheckpointError`] if the file holds no state, or that of another scene.
+    pub fn read(path: &Path, scenario: &str, ticks: usize) -> Result<Option<Self>, CheckpointError> {
         let at = || path.to_path_buf();
         let text = match bounded_file::read_text(path, MAX_BYTES) {
             Ok(text) => text,
             Err(error) if error.kind() == ErrorKind::NotFound => return Ok(None),
-            Err(source) => return Err(BookmarkError::Read { path: at(), source }),
+            Err(source) => return Err(CheckpointError::Read { path: at(), source }),
         };
-        let place: Self = serde_json::from_str(&text).map_err(|source| BookmarkError::Text { path: at(), source })?;
+        let place: Self = serde_json::from_str(&text).map_err(|source| CheckpointError::Text { path: at(), source })?;
         if place.scenario != scenario || place.position.next_tick > ticks {
             let position = format!("is tick {} of scenario {}", place.position.next_tick, place.scenario);
-            return Err(BookmarkError::Elsewhere { path: at(), place: position, scenario: scenario.into(), ticks });
+            return Err(CheckpointError::Elsewhere { path: at(), place: position, scenario: scenario.into(), ticks });
         }
         Ok(Some(place))
     }
@@ -65,7 +65,7 @@ impl Place {
 
 /// Reasons why a checkpoint cannot be read.
 #[derive(Debug, thiserror::Error)]
-pub enum BookmarkError {
+pub enum CheckpointError {
     /// The file cannot be read.
     #[error("{}: {source}", path.display())]
     Read {
@@ -191,7 +191,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("place.json");
         write(&path, &place()).unwrap();
-        let error_of = |found: Result<Option<Place>, BookmarkError>| found.unwrap_err().to_string();
+        let error_of = |found: Result<Option<Place>, CheckpointError>| found.unwrap_err().to_string();
         for (scenario, ticks) in [("town4", 10), ("town1", 6)] {
             let error = error_of(Place::read(&path, scenario, ticks));
             assert!(error.contains("tick 7 of scenario town1") && error.contains(scenario), "{error}");

@@ -3,7 +3,7 @@
 //! - [`Schedule`]: order of the ticks, and their time on the replay's clock.
 //! - [`ReplayClock`]: wall-clock time of a tick; pause, step, rate.
 //! - [`ReadAhead`]: reads the next ticks during the wait for the current one.
-//! - [`AirReport`]: counters of frames on an emulated link to the agents.
+//! - [`SensorLinkReport`]: counters of frames on an emulated link to the agents.
 //! - [`Place`]: state of the replay, from which a restarted one resumes.
 //! - [`Replay`]: the main loop, controlled over `control/*`.
 
@@ -16,10 +16,10 @@ mod schedule;
 mod sensor_link;
 mod sensor_publisher;
 
-pub use checkpoint::{BookmarkError, Place};
+pub use checkpoint::{CheckpointError, Place};
 pub use clock::ReplayClock;
 pub use read_ahead::{ReadAhead, TickFrames};
 pub use replay::{Replay, StreamError, StreamOptions};
 pub use report::{Lateness, StreamReport, Unreadable};
 pub use schedule::{Planned, Position, Schedule};
-pub use sensor_link::AirReport;
+pub use sensor_link::SensorLinkReport;

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use protocol::{CavId, Control, Limits, Role, Stream, Topic, Truth, Verb};
 
 use super::ReplayClock;
-use super::checkpoint::{BookmarkError, Checkpoint, Place};
+use super::checkpoint::{Checkpoint, CheckpointError, Place};
 use super::read_ahead::{ReadAhead, TickFrames};
 use super::report::StreamReport;
 use super::schedule::{Planned, Schedule};
@@ -26,7 +26,7 @@ const READ_AHEAD: usize = 4;
 const COMMANDS: usize = 64;
 /// Longest time that a restarted replay waits for the routes: other processes may be down, and the scene does not wait
 /// for them.
-const RESUME_PATIENCE: Duration = Duration::from_secs(2);
+const RESUME_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// Options of a replay.
 #[derive(Debug, Clone)]
@@ -48,16 +48,16 @@ pub struct StreamOptions {
     /// Further routes that must be up before the clock starts.
     pub expect: Vec<Route>,
     /// Longest time to wait for the routes.
-    pub patience: Duration,
+    pub timeout: Duration,
     /// Egos whose detections of a tick are awaited before the next; empty: the clock does not wait.
     pub lockstep: Vec<CavId>,
     /// Longest time to wait for an ego's detections; then the tick counts as unanswered.
-    pub answer_patience: Duration,
+    pub answer_timeout: Duration,
     /// Link emulation between sensors and agents, and its seed; `None`: frames arrive at once.
     pub link: Option<(LinkConfig, u64)>,
     /// Checkpoint file, written after each tick; if it exists, the replay resumes from it instead of starting at
     /// `seek`.
-    pub bookmark: Option<PathBuf>,
+    pub checkpoint: Option<PathBuf>,
 }
 
 impl Default for StreamOptions {
@@ -71,11 +71,11 @@ impl Default for StreamOptions {
             load: LoadOptions::default(),
             await_agents: true,
             expect: Vec::new(),
-            patience: Duration::from_secs(60),
+            timeout: Duration::from_secs(60),
             lockstep: Vec::new(),
-            answer_patience: Duration::from_secs(60),
+            answer_timeout: Duration::from_secs(60),
             link: None,
-            bookmark: None,
+            checkpoint: None,
         }
     }
 }
@@ -120,8 +120,8 @@ pub enum StreamError {
     #[error("a link and lockstep exclude each other: a tick whose frames are late or lost is not answered")]
     LinkInLockstep,
     /// The checkpoint is invalid.
-    #[error("bookmark: {0}")]
-    Checkpoint(#[from] BookmarkError),
+    #[error("checkpoint: {0}")]
+    Checkpoint(#[from] CheckpointError),
     /// Not every route is up.
     #[error("the fleet is not ready: {0}")]
     NotReady(#[from] NotReady),
@@ -139,7 +139,7 @@ pub struct Replay<'a> {
     options: StreamOptions,
     scenario: String,
     tick_count: usize,
-    bookmark: Option<Checkpoint>,
+    checkpoint: Option<Checkpoint>,
     is_resumed: bool,
     reading: ReadAhead,
     schedule: Schedule,
@@ -171,7 +171,7 @@ impl<'a> Replay<'a> {
         let cavs: Vec<CavId> = agents.iter().map(|&index| scenario.agents[index].clone()).collect();
         let options = StreamOptions { agents: cavs, ..options };
         let read = |path: &PathBuf| Place::read(path, &scenario.name, scenario.ticks.len());
-        let place = options.bookmark.as_ref().map(read).transpose()?.flatten();
+        let place = options.checkpoint.as_ref().map(read).transpose()?.flatten();
         let schedule = Schedule::new(&scenario.ticks, options.seek, options.frames, options.repeats);
         let mut clock = ReplayClock::new(options.rate);
         let schedule = match &place {
@@ -197,7 +197,7 @@ impl<'a> Replay<'a> {
             bus,
             scenario: scenario.name.clone(),
             tick_count: scenario.ticks.len(),
-            bookmark: options.bookmark.clone().map(Checkpoint::open).transpose().map_err(StreamError::Thread)?,
+            checkpoint: options.checkpoint.clone().map(Checkpoint::open).transpose().map_err(StreamError::Thread)?,
             is_resumed: place.is_some(),
             reading,
             schedule,
@@ -221,13 +221,13 @@ impl<'a> Replay<'a> {
     pub fn wait_until_ready(&self) -> Result<(), StreamError> {
         let barrier = Barrier::new(self.expected_routes()).await_routes(self.bus)?;
         let stop = self.stop.clone();
-        let wait = |patience| barrier.wait_unless(patience, || stop.requested());
+        let wait = |timeout| barrier.wait_unless(timeout, || stop.requested());
         if !self.is_resumed {
-            return Ok(wait(self.options.patience)?);
+            return Ok(wait(self.options.timeout)?);
         }
         let (tick, ticks) = (self.schedule.position().next_tick, self.tick_count);
         tracing::warn!(tick, ticks, "resuming from the checkpoint of the previous process instance");
-        if let Err(not_ready) = wait(RESUME_PATIENCE.min(self.options.patience)) {
+        if let Err(not_ready) = wait(RESUME_TIMEOUT.min(self.options.timeout)) {
             tracing::warn!("the replay continues, although {not_ready}");
         }
         Ok(())
@@ -254,12 +254,12 @@ impl<'a> Replay<'a> {
         self.await_the_last();
         drop(working);
         let Self { bus, outlet, sensor_link, mut report, .. } = self;
-        report.air = sensor_link.map(|link| link.report().clone());
+        report.sensor_link = sensor_link.map(|link| link.report().clone());
         report.seconds = last.duration_since(began).as_secs_f64();
         report.lateness.sum_up();
         report.sent = outlet.finish();
-        report.count_unsent(&bus.books().ledger());
-        bus.say(Control::End { ticks: report.ticks, sent: report.sent.clone() }, 0);
+        report.count_unsent(&bus.stats().ledger());
+        bus.publish_control(Control::End { ticks: report.ticks, sent: report.sent.clone() }, 0);
         report
     }
 
@@ -314,7 +314,7 @@ impl<'a> Replay<'a> {
     fn deliver(&mut self) {
         let Some(link) = &mut self.sensor_link else { return };
         for DelayedSweep { agent, capture_nanos, frame } in link.arrived(Instant::now()) {
-            self.outlet.offer(agent, capture_nanos, frame);
+            self.outlet.submit(agent, capture_nanos, frame);
         }
     }
 
@@ -330,9 +330,9 @@ impl<'a> Replay<'a> {
 
     /// After a tick was submitted completely: a restarted replay resumes with the next one.
     fn note_place(&self) {
-        let Some(bookmark) = &self.bookmark else { return };
+        let Some(checkpoint) = &self.checkpoint else { return };
         let StreamReport { ticks, unanswered, unreadable_frames, .. } = self.report;
-        bookmark.note(Place {
+        checkpoint.note(Place {
             scenario: self.scenario.clone(),
             position: self.schedule.position(),
             is_halted: self.clock.is_halted(),
@@ -375,10 +375,10 @@ impl<'a> Replay<'a> {
                 Ok(frame) => {
                     self.report.parts_left_out(&frame);
                     match &mut self.sensor_link {
-                        None => self.outlet.offer(agent, capture_nanos, frame),
+                        None => self.outlet.submit(agent, capture_nanos, frame),
                         Some(link) => {
                             let cav = frame.cav.clone();
-                            link.offer(&cav, DelayedSweep { agent, capture_nanos, frame }, Instant::now());
+                            link.submit(&cav, DelayedSweep { agent, capture_nanos, frame }, Instant::now());
                         }
                     }
                 }
@@ -386,7 +386,7 @@ impl<'a> Replay<'a> {
                 Err(error) => self.report.unreadable(capture_nanos, &error),
             }
         }
-        self.outlet.offer_truth(capture_nanos, Truth { tick: tick_index as u64, agents });
+        self.outlet.submit_truth(capture_nanos, Truth { tick: tick_index as u64, agents });
         self.deliver();
         self.report.ticks += 1;
         self.clock.published(capture_nanos, due);
@@ -400,11 +400,11 @@ impl<'a> Replay<'a> {
         let capture_nanos = planned.capture_nanos;
         let is_asked = |ego: &&CavId| self.present.contains(ego);
         let mut missing: BTreeSet<CavId> = self.options.lockstep.iter().filter(is_asked).cloned().collect();
-        let deadline = end_of(self.options.answer_patience);
+        let deadline = end_of(self.options.answer_timeout);
         while !missing.is_empty() {
             match self.inbox.take(deadline) {
                 Pop::Item(Topic::Stream { cav, .. }, Event::Message(arrival)) => {
-                    self.bus.books().received(&arrival.topic);
+                    self.bus.stats().received(&arrival.topic);
                     if arrival.header.stamp.capture_nanos >= capture_nanos {
                         missing.remove(&cav);
                     }
@@ -416,7 +416,7 @@ impl<'a> Replay<'a> {
                 }
                 Pop::Item(_, Event::End { .. }) => {}
                 Pop::TimedOut => {
-                    tracing::error!(capture_nanos, ?missing, "no detections within {:?}", self.options.answer_patience);
+                    tracing::error!(capture_nanos, ?missing, "no detections within {:?}", self.options.answer_timeout);
                     self.report.unanswered += 1;
                     break;
                 }
@@ -429,8 +429,8 @@ impl<'a> Replay<'a> {
 }
 
 /// End of a timeout that begins now; `None` if it is beyond the range of the clock: no end.
-fn end_of(patience: Duration) -> Option<Instant> {
-    Instant::now().checked_add(patience)
+fn end_of(timeout: Duration) -> Option<Instant> {
+    Instant::now().checked_add(timeout)
 }
 
 fn check(scenario: &Scenario, options: &StreamOptions) -> Result<(), StreamError> {

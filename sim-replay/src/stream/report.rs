@@ -8,7 +8,7 @@ use serde::Serialize;
 
 use dataset::frame::Frame;
 
-use super::sensor_link::AirReport;
+use super::sensor_link::SensorLinkReport;
 use support::statistics::{quantile, sorted};
 
 /// Publishing later than this counts as late.
@@ -42,7 +42,7 @@ pub struct StreamReport {
     pub unreadable: Vec<Unreadable>,
     /// Counters of sensor frames on the emulated link, if there is one.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub air: Option<AirReport>,
+    pub sensor_link: Option<SensorLinkReport>,
 }
 
 /// A frame that could not be read.

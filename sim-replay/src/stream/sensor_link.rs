@@ -16,9 +16,9 @@ const POINT_BYTES: u64 = 16;
 
 /// Counters of replayed sensor frames on the link.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
-pub struct AirReport {
+pub struct SensorLinkReport {
     /// Frames submitted.
-    pub offered: u64,
+    pub submitted: u64,
     /// Frames that reached their agent, copies counted.
     pub arrived: u64,
     /// Frames that did not reach their agent, by reason.
@@ -42,7 +42,7 @@ pub(super) struct SensorLink {
     /// By vehicle, as for its own messages: losses must not depend on the other vehicles.
     next_sequences: BTreeMap<CavId, u64>,
     began: Instant,
-    report: AirReport,
+    report: SensorLinkReport,
 }
 
 impl SensorLink {
@@ -55,24 +55,24 @@ impl SensorLink {
             next_id: 0,
             next_sequences: BTreeMap::new(),
             began: Instant::now(),
-            report: AirReport::default(),
+            report: SensorLinkReport::default(),
         })
     }
 
     /// Submits the current frame of vehicle `cav`. Data of all its sensors at a tick are transmitted together.
-    pub(super) fn offer(&mut self, cav: &CavId, held: DelayedSweep, now: Instant) {
+    pub(super) fn submit(&mut self, cav: &CavId, held: DelayedSweep, now: Instant) {
         let Frame { points, radar, .. } = &held.frame;
         let points = points.len() + radar.as_ref().map_or(0, |radar| radar.len());
         let bytes = HEADER_LEN as u64 + POINT_BYTES * points as u64;
-        let (id, offered_nanos) = (self.next_id, nanos::between(self.began, now));
+        let (id, submitted_nanos) = (self.next_id, nanos::between(self.began, now));
         self.next_id += 1;
         let next_sequence = self.next_sequences.entry(cav.clone()).or_default();
         let sequence = *next_sequence;
         *next_sequence += 1;
-        self.report.offered += 1;
+        self.report.submitted += 1;
         self.held.insert(id, held);
         let (from, to, stream) = (cav.clone(), cav.clone(), Stream::Lidar);
-        self.emulator.offer(Packet { id, from, to, stream, sequence, bytes, offered_nanos, distance_m: 0.0 });
+        self.emulator.submit(Packet { id, from, to, stream, sequence, bytes, submitted_nanos, distance_m: 0.0 });
     }
 
     /// Time at which the next frame can arrive; `None` while none is in flight.
@@ -83,7 +83,7 @@ impl SensorLink {
     /// Frames that have arrived by now.
     pub(super) fn arrived(&mut self, now: Instant) -> Vec<DelayedSweep> {
         let mut arrived = Vec::new();
-        for Outcome { parcel: packet, fate: delivery, .. } in self.emulator.advance(nanos::between(self.began, now)) {
+        for Outcome { packet, delivery, .. } in self.emulator.advance(nanos::between(self.began, now)) {
             match delivery {
                 Delivery::Dropped(reason) => {
                     self.held.remove(&packet.id);
@@ -97,7 +97,7 @@ impl SensorLink {
         arrived
     }
 
-    pub(super) fn report(&self) -> &AirReport {
+    pub(super) fn report(&self) -> &SensorLinkReport {
         &self.report
     }
 }
@@ -123,7 +123,7 @@ mod tests {
             let mut link_under_test = SensorLink::new(&lossy, 1).unwrap();
             let began = link_under_test.began;
             for tick in 0..100 {
-                cavs.iter().for_each(|cav| link_under_test.offer(cav, held(cav, tick), began));
+                cavs.iter().for_each(|cav| link_under_test.submit(cav, held(cav, tick), began));
             }
             let arrived = link_under_test.arrived(began).into_iter().filter(|held| held.frame.cav == cav);
             arrived.map(|held| held.capture_nanos).collect::<Vec<_>>()
@@ -143,8 +143,8 @@ mod tests {
         let mut link_under_test = SensorLink::new(&link, 1).unwrap();
         let at = Duration::from_millis;
         let began = link_under_test.began;
-        link_under_test.offer(&cav, held(&cav, 0), began);
-        link_under_test.offer(&cav, held(&cav, 1), began);
+        link_under_test.submit(&cav, held(&cav, 0), began);
+        link_under_test.submit(&cav, held(&cav, 1), began);
         assert!(link_under_test.arrived(began + at(107)).is_empty());
         let first = link_under_test.arrived(began + at(110));
         assert_eq!(first.iter().map(|held| held.capture_nanos).collect::<Vec<_>>(), [0]);
@@ -155,11 +155,11 @@ mod tests {
         let mut lossy =
             SensorLink::new(&LinkConfig { loss: LossModel::Bernoulli(0.5), ..LinkConfig::default() }, 1).unwrap();
         let began = lossy.began;
-        (0..200).for_each(|tick| lossy.offer(&cav, held(&cav, tick), began));
+        (0..200).for_each(|tick| lossy.submit(&cav, held(&cav, tick), began));
         let arrived = lossy.arrived(began).len() as u64;
         let report = lossy.report();
         assert!((70..130).contains(&arrived), "{arrived}");
-        assert_eq!((report.offered, report.arrived), (200, arrived));
+        assert_eq!((report.submitted, report.arrived), (200, arrived));
         assert_eq!(report.dropped.get(&DropReason::LinkLoss), Some(&(200 - arrived)));
     }
 }

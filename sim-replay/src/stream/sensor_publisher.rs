@@ -49,29 +49,29 @@ impl SensorPublisher {
     }
 
     /// Submits the data of one vehicle captured at `capture_nanos`.
-    pub(super) fn offer(&mut self, agent: usize, capture_nanos: u64, frame: Frame) {
+    pub(super) fn submit(&mut self, agent: usize, capture_nanos: u64, frame: Frame) {
         let Some(sensors) = self.sensors.get(agent) else { return };
         if let Some(world_from_lidar) = frame.world_from_lidar {
             // The pose is sent first: it is small, and the sweep cannot be used without it.
             let source = GnssSource::Recorded;
             let gnss = Gnss { world_from_lidar, position_std_m: 0.0, heading_std_rad: 0.0, source };
-            sensors.gnss.offer(capture_nanos, gnss);
+            sensors.gnss.submit(capture_nanos, gnss);
             count(&mut self.sent, sensors.gnss.topic());
         }
         if sensors.preview.is_wanted() {
-            sensors.preview.offer(capture_nanos, Lidar { points: frame.points.decimate(PREVIEW_POINTS) });
+            sensors.preview.submit(capture_nanos, Lidar { points: frame.points.decimate(PREVIEW_POINTS) });
         }
-        sensors.lidar.offer(capture_nanos, Lidar { points: frame.points });
+        sensors.lidar.submit(capture_nanos, Lidar { points: frame.points });
         count(&mut self.sent, sensors.lidar.topic());
         if let (Some(publisher), Some(points)) = (&sensors.radar, frame.radar) {
-            publisher.offer(capture_nanos, Radar { points });
+            publisher.submit(capture_nanos, Radar { points });
             count(&mut self.sent, publisher.topic());
         }
     }
 
     /// Submits the ground truth of one tick.
-    pub(super) fn offer_truth(&mut self, capture_nanos: u64, truth: Truth) {
-        self.truth.offer(capture_nanos, truth);
+    pub(super) fn submit_truth(&mut self, capture_nanos: u64, truth: Truth) {
+        self.truth.submit(capture_nanos, truth);
         count(&mut self.sent, self.truth.topic());
     }
 

@@ -33,7 +33,7 @@ const FLOOD_PERIOD: Duration = Duration::from_millis(1);
 /// Warm-up before the measurement.
 const WARM_UP: Duration = Duration::from_secs(3);
 /// Longest time until a process ends.
-const PATIENCE: Duration = Duration::from_secs(5);
+const TIMEOUT: Duration = Duration::from_secs(5);
 
 /// Setting of a measurement.
 pub(crate) struct Setting {
@@ -128,7 +128,7 @@ impl Part {
 impl Drop for Part {
     fn drop(&mut self) {
         drop(self.child.stdin.take());
-        let until = Instant::now() + PATIENCE;
+        let until = Instant::now() + TIMEOUT;
         while Instant::now() < until && matches!(self.child.try_wait(), Ok(None)) {
             thread::sleep(Duration::from_millis(20));
         }
@@ -220,14 +220,14 @@ impl Place {
             let Some(map) = inbox.decode::<Bev>(&arrival, &Limits::DEFAULT) else { continue };
             map.features.decode(&Limits::DEFAULT)?;
             let took_ms = unix_nanos().saturating_sub(arrival.header.stamp.publish_nanos) as f64 / 1e6;
-            ego.books().received(&topic);
+            ego.stats().received(&topic);
             if flooding.contains(&topic) {
                 measured.decoded += 1;
             } else if began.elapsed() > WARM_UP {
                 measured.latencies_ms.push(took_ms);
             }
         }
-        let ledger = ego.books().ledger();
+        let ledger = ego.stats().ledger();
         for topic in flooding {
             let here = Account::towards(topic, &ego.identity().process);
             let refused = ledger.get(&here).and_then(|counts| counts.dropped.get(&DropReason::RateLimit));
@@ -235,7 +235,7 @@ impl Place {
         }
         print(&serde_json::to_string(&measured)?)?;
         drop(subscriptions);
-        Ok(ego.leave(PATIENCE)?)
+        Ok(ego.leave(TIMEOUT)?)
     }
 
     fn send_maps(&self, duration: Duration) -> Result<()> {
@@ -253,12 +253,12 @@ impl Place {
             thread::sleep(due.saturating_sub(began.elapsed()));
             let index = turn as usize % HONEST.len();
             let map = maps[index].clone();
-            publishers[index].offer_encoded(u64::from(turn), move |stamp| {
+            publishers[index].submit_encoded(u64::from(turn), move |stamp| {
                 wire::encode(stamp, Bev { pose, features: encode_features(map, &CodecConfig::default(), None)? })
             });
         }
         drop(publishers);
-        buses.into_iter().try_for_each(|bus| Ok(bus.leave(PATIENCE)?))
+        buses.into_iter().try_for_each(|bus| Ok(bus.leave(TIMEOUT)?))
     }
 
     /// Valid messages of its own vehicle, as many as the network takes.
@@ -284,7 +284,7 @@ impl Place {
             thread::sleep(due.saturating_sub(began.elapsed()));
         }
         print(&sent.to_string())?;
-        Ok(bus.leave(PATIENCE)?)
+        Ok(bus.leave(TIMEOUT)?)
     }
 }
 

@@ -17,7 +17,7 @@ use protocol::{
 };
 use serde::{Deserialize, Serialize};
 use sim_replay::link_node::{self, NodeOptions};
-use tests::bus::{PATIENCE, free_port};
+use tests::bus::{TIMEOUT, free_port};
 use zenoh::bytes::ZBytes;
 use zenoh::{Session, Wait};
 
@@ -28,8 +28,8 @@ const SILENCE: Duration = Duration::from_secs(3);
 
 /// Observations of both ends of a run.
 #[derive(Debug, Default, Serialize, Deserialize)]
-pub(crate) struct Seen {
-    pub(crate) offers: Vec<Offer>,
+pub(crate) struct Measurement {
+    pub(crate) submissions: Vec<Submission>,
     pub(crate) arrivals: Vec<Arrived>,
     /// Of all processes; empty without message accounting.
     pub(crate) ledger: Ledger,
@@ -37,7 +37,7 @@ pub(crate) struct Seen {
 
 /// One call of the publisher.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
-pub(crate) struct Offer {
+pub(crate) struct Submission {
     /// Start of the call; sent as the capture time.
     pub(crate) capture_nanos: u64,
     /// Duration of the call.
@@ -63,7 +63,7 @@ pub(crate) fn cav(text: &str) -> CavId {
 
 /// Agent, link and ego over a router on loopback. The router is a process of its own, as in a run: a router that waits
 /// for a receiver blocks a thread on which all sessions of a process read, the receiver's own among them.
-pub(crate) fn over_link(cell: &Cell) -> Result<Seen> {
+pub(crate) fn over_link(cell: &Cell) -> Result<Measurement> {
     let endpoint = Endpoint::loopback(free_port());
     let mut router = Command::new(std::env::current_exe()?);
     let router = router.args(["router", endpoint.as_str()]).stdin(Stdio::piped()).spawn()?;
@@ -73,30 +73,30 @@ pub(crate) fn over_link(cell: &Cell) -> Result<Seen> {
     seen
 }
 
-fn between(cell: &Cell, router: &Endpoint) -> Result<Seen> {
+fn between(cell: &Cell, router: &Endpoint) -> Result<Measurement> {
     let join = |name, cav| join(router, name, cav);
     let (agent, link, ego) = (join("agent-7", "7")?, join("link-9", "9")?, join("ego-9", "9")?);
     let config = LinkConfig {
         capacity: CapacityConfig::TokenBucket { rate_mbps: cell.rate_mbps, burst_bytes: 0 },
-        queue: QueueConfig { keep_newest: true, ..QueueConfig::default() },
+        queue: QueueConfig { keep_last: true, ..QueueConfig::default() },
         ..LinkConfig::default()
     };
     let emulator = LinkEmulator::new(config, Path::new("."), 1)?;
     let options = NodeOptions::new(cav("9"), vec![Stream::Bev]);
     let received = Topic::Received { ego: cav("9"), cav: cav("7"), stream: Stream::Bev };
     let stop = Stop::new();
-    let (offers, arrivals) = thread::scope(|scope| {
+    let (submissions, arrivals) = thread::scope(|scope| {
         let carrying = scope.spawn(|| link_node::run(&link, emulator, &options, &stop));
         let receiving = scope.spawn(|| receive(&ego, &received));
-        let offers = send(&agent, cell, &[(sent_topic(), "link-9"), (received.clone(), "ego-9")]);
+        let submissions = send(&agent, cell, &[(sent_topic(), "link-9"), (received.clone(), "ego-9")]);
         // Messages in flight are counted as such without waiting for them.
         stop.request();
         carrying.join().expect("no panic")?;
-        anyhow::Ok((offers?, receiving.join().expect("no panic")?))
+        anyhow::Ok((submissions?, receiving.join().expect("no panic")?))
     })?;
     let mut ledger = Ledger::default();
-    [&agent, &link, &ego].iter().for_each(|bus| ledger.merge(&bus.books().ledger()));
-    Ok(Seen { offers, arrivals, ledger })
+    [&agent, &link, &ego].iter().for_each(|bus| ledger.merge(&bus.stats().ledger()));
+    Ok(Measurement { submissions, arrivals, ledger })
 }
 
 /// Routes messages until its input ends.
@@ -113,17 +113,17 @@ pub(crate) fn join(router: &Endpoint, process: &str, cav: &str) -> Result<Bus> {
 }
 
 /// Offers feature maps until the time is over, as an agent does, and waits until they are sent.
-pub(crate) fn send(agent: &Bus, cell: &Cell, routes: &[(Topic, &str)]) -> Result<Vec<Offer>> {
+pub(crate) fn send(agent: &Bus, cell: &Cell, routes: &[(Topic, &str)]) -> Result<Vec<Submission>> {
     let presence = agent.announce(Role::Agent)?;
     let publisher = agent.publisher(sent_topic(), PublisherOptions::FEATURES)?;
     let routes = routes.iter().map(|(topic, receiver)| Ok(Route { topic: topic.clone(), receiver: receiver.parse()? }));
-    Barrier::new(routes.collect::<Result<Vec<_>>>()?).await_routes(agent)?.wait(PATIENCE)?;
+    Barrier::new(routes.collect::<Result<Vec<_>>>()?).await_routes(agent)?.wait(TIMEOUT)?;
     let map = features(cell.bytes);
-    let offers = at_10_hz(
+    let submissions = at_10_hz(
         cell,
         || map.clone(),
         |capture_nanos, map| {
-            publisher.offer_encoded(capture_nanos, move |stamp| {
+            publisher.submit_encoded(capture_nanos, move |stamp| {
                 let features = encode_features(map, &CodecConfig::default(), None)?;
                 protocol::wire::encode(stamp, Bev { pose: PoseEstimate::new(Pose::IDENTITY, 1.0), features })
             });
@@ -131,7 +131,7 @@ pub(crate) fn send(agent: &Bus, cell: &Cell, routes: &[(Topic, &str)]) -> Result
     );
     publisher.finish();
     presence.withdraw()?;
-    Ok(offers)
+    Ok(submissions)
 }
 
 /// Receives feature maps, decodes them, and records the times.
@@ -141,7 +141,7 @@ pub(crate) fn receive(ego: &Bus, topic: &Topic) -> Result<Vec<Arrived>> {
     let mut arrivals = Vec::new();
     while let bus::bounded_queue::Pop::Item(_, Event::Message(arrival)) = inbox.take(None) {
         if inbox.decode::<Bev>(&arrival, &Limits::DEFAULT).is_some() {
-            ego.books().received(topic);
+            ego.stats().received(topic);
             let capture_nanos = arrival.header.stamp.capture_nanos;
             arrivals.push(Arrived { capture_nanos, nanos: unix_nanos(), bytes: arrival.wire_bytes() });
         }
@@ -152,11 +152,11 @@ pub(crate) fn receive(ego: &Bus, topic: &Topic) -> Result<Vec<Arrived>> {
 const PLAIN_KEY: &str = "v2v/plain";
 
 /// The same with bare zenoh: the capture time and zeros.
-pub(crate) fn send_plain(session: &Session, cell: &Cell) -> Result<Vec<Offer>> {
+pub(crate) fn send_plain(session: &Session, cell: &Cell) -> Result<Vec<Submission>> {
     let publisher = session.declare_publisher(PLAIN_KEY).wait().map_err(anyhow::Error::from_boxed)?;
     tests::bus::wait_for("a route", || publisher.matching_status().wait().is_ok_and(|status| status.matching()));
     let bytes = cell.bytes;
-    let offers = at_10_hz(
+    let submissions = at_10_hz(
         cell,
         || vec![0_u8; bytes],
         |capture_nanos, mut map| {
@@ -167,7 +167,7 @@ pub(crate) fn send_plain(session: &Session, cell: &Cell) -> Result<Vec<Offer>> {
             }
         },
     );
-    Ok(offers)
+    Ok(submissions)
 }
 
 /// Receives messages until `is_over` and none has come for a while.
@@ -194,16 +194,16 @@ pub(crate) fn receive_plain(session: &Session, is_over: impl Fn() -> bool) -> Re
     Ok(arrivals)
 }
 
-/// Calls `offer` at the rate of a LiDAR, with a feature map made before.
-fn at_10_hz<M>(cell: &Cell, make: impl Fn() -> M, mut offer: impl FnMut(u64, M)) -> Vec<Offer> {
+/// Calls `submit` at the rate of a LiDAR, with a feature map made before.
+fn at_10_hz<M>(cell: &Cell, make: impl Fn() -> M, mut submit: impl FnMut(u64, M)) -> Vec<Submission> {
     let began = Instant::now();
     let count = (cell.duration.as_secs_f64() / PERIOD.as_secs_f64()).round() as u32;
     let ticks = (0..count).map(|tick| {
         let map = make();
         thread::sleep((began + tick * PERIOD).saturating_duration_since(Instant::now()));
         let (capture_nanos, called) = (unix_nanos(), Instant::now());
-        offer(capture_nanos, map);
-        Offer { capture_nanos, waited_nanos: called.elapsed().as_nanos() as u64 }
+        submit(capture_nanos, map);
+        Submission { capture_nanos, waited_nanos: called.elapsed().as_nanos() as u64 }
     });
     ticks.collect()
 }

@@ -20,9 +20,9 @@
 //! no message lost without a reason, no call of the publisher longer than 5 ms, 95th percentile of the age of the
 //! newest feature map, at every millisecond from the first arrival on, below twice the transmission time and 100 ms.
 
-mod cable;
 mod ends;
 mod table;
+mod virtual_link;
 
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -40,17 +40,17 @@ const PERIOD: Duration = Duration::from_millis(100);
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Way {
     Link,
-    Cable,
+    VirtualLink,
     Plain,
 }
 
 impl Way {
-    const ALL: [Self; 3] = [Self::Link, Self::Cable, Self::Plain];
+    const ALL: [Self; 3] = [Self::Link, Self::VirtualLink, Self::Plain];
 
     fn name(self) -> &'static str {
         match self {
             Self::Link => "link",
-            Self::Cable => "cable",
+            Self::VirtualLink => "veth",
             Self::Plain => "plain",
         }
     }
@@ -130,7 +130,7 @@ fn measure(wanted: &Wanted) -> Result<Vec<Row>> {
             for &way in &wanted.ways {
                 let seen = match way {
                     Way::Link => ends::over_link(&cell)?,
-                    Way::Cable | Way::Plain => cable::over_cable(&cell, way)?,
+                    Way::VirtualLink | Way::Plain => virtual_link::over_virtual_link(&cell, way)?,
                 };
                 let row = Row::of(&cell, way, &seen);
                 eprintln!("{}", row.markdown());
@@ -145,7 +145,7 @@ fn main() -> Result<ExitCode> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     // One end of the cable, in a namespace of its own.
     if arguments.first().is_some_and(|argument| argument == "end") {
-        cable::run_end(&arguments[1..])?;
+        virtual_link::run_end(&arguments[1..])?;
         return Ok(ExitCode::SUCCESS);
     }
     if let [role, endpoint] = arguments.as_slice()

@@ -10,11 +10,11 @@ use protocol::DropReason;
 use support::statistics;
 use tests::machine;
 
-use super::ends::Seen;
+use super::ends::Measurement;
 use super::{Cell, Way};
 
 /// Longest time that a publisher may block its caller, milliseconds.
-const OFFER_TARGET_MS: f64 = 5.0;
+const SUBMIT_TARGET_MS: f64 = 5.0;
 
 /// One line of the table. Times in milliseconds.
 pub(crate) struct Row {
@@ -22,12 +22,12 @@ pub(crate) struct Row {
     rate_mbps: f64,
     bytes: usize,
     seconds: f64,
-    offered: usize,
+    submitted: usize,
     arrived: usize,
     /// By reason, and the number of unexplained losses.
     dropped: BTreeMap<DropReason, u64>,
     unexplained: i64,
-    offer_max_ms: f64,
+    submit_max_ms: f64,
     transport_p50_ms: f64,
     age_p50_ms: f64,
     age_p95_ms: f64,
@@ -36,7 +36,7 @@ pub(crate) struct Row {
 }
 
 impl Row {
-    pub(crate) fn of(cell: &Cell, way: Way, seen: &Seen) -> Self {
+    pub(crate) fn of(cell: &Cell, way: Way, seen: &Measurement) -> Self {
         let ages = ages_ms(seen);
         let took = seen.arrivals.iter().map(|arrival| millis(arrival.capture_nanos, arrival.nanos));
         let dropped = seen.ledger.total().dropped;
@@ -44,7 +44,7 @@ impl Row {
             seen.ledger.iter().filter(|(account, _)| account.to.is_none()).map(|(_, c)| c.in_flight).sum();
         let unexplained = if seen.ledger.is_empty() {
             // zenoh reports no drops.
-            seen.offers.len() as i64 - seen.arrivals.len() as i64
+            seen.submissions.len() as i64 - seen.arrivals.len() as i64
         } else if seen.ledger.balance().is_exact() {
             on_the_way as i64
         } else {
@@ -55,11 +55,11 @@ impl Row {
             rate_mbps: cell.rate_mbps,
             bytes: cell.bytes,
             seconds: cell.duration.as_secs_f64(),
-            offered: seen.offers.len(),
+            submitted: seen.submissions.len(),
             arrived: seen.arrivals.len(),
             dropped,
             unexplained,
-            offer_max_ms: seen.offers.iter().map(|offer| offer.waited_nanos as f64 / 1e6).fold(0.0, f64::max),
+            submit_max_ms: seen.submissions.iter().map(|submit| submit.waited_nanos as f64 / 1e6).fold(0.0, f64::max),
             transport_p50_ms: quantile(&took.collect::<Vec<_>>(), 0.5),
             age_p50_ms: quantile(&ages, 0.5),
             age_p95_ms: quantile(&ages, 0.95),
@@ -70,7 +70,7 @@ impl Row {
 
     /// True if no message is missing, no call blocked and the newest feature map is new enough.
     pub(crate) fn is_on_target(&self) -> bool {
-        self.unexplained == 0 && self.offer_max_ms <= OFFER_TARGET_MS && self.age_p95_ms <= self.age_target_ms
+        self.unexplained == 0 && self.submit_max_ms <= SUBMIT_TARGET_MS && self.age_p95_ms <= self.age_target_ms
     }
 
     pub(crate) fn markdown(&self) -> String {
@@ -89,9 +89,9 @@ impl Row {
             self.way,
             self.seconds,
             self.arrived,
-            self.offered,
+            self.submitted,
             if reasons.is_empty() { "-".to_owned() } else { reasons.join(", ") },
-            self.offer_max_ms,
+            self.submit_max_ms,
             self.transport_p50_ms,
             self.age_p50_ms,
             self.age_p95_ms,
@@ -111,13 +111,13 @@ impl Row {
             self.rate_mbps,
             self.bytes,
             self.seconds,
-            self.offered,
+            self.submitted,
             self.arrived,
             dropped(DropReason::Superseded),
             dropped(DropReason::Stale),
             other,
             self.unexplained,
-            self.offer_max_ms,
+            self.submit_max_ms,
             self.transport_p50_ms,
             self.age_p50_ms,
             self.age_p95_ms,
@@ -132,8 +132,8 @@ impl Row {
 pub(crate) fn write(folder: &Path, arguments: &str, rows: &[Row]) -> Result<()> {
     fs::create_dir_all(folder)?;
     let mut csv =
-        "way,rate_mbps,bytes,seconds,offered,arrived,superseded,under_way_at_end,dropped_otherwise,unexplained,\
-        offer_max_ms,transport_p50_ms,age_p50_ms,age_p95_ms,age_target_ms,throughput_mbps,on_target\n"
+        "way,rate_mbps,bytes,seconds,submitted,arrived,superseded,under_way_at_end,dropped_otherwise,unexplained,\
+        submit_max_ms,transport_p50_ms,age_p50_ms,age_p95_ms,age_target_ms,throughput_mbps,on_target\n"
             .to_owned();
     let mut markdown = format!(
         "`cargo bench -p tests --bench slow_link -- {arguments}`\n\n{}\n\n\
@@ -151,8 +151,8 @@ pub(crate) fn write(folder: &Path, arguments: &str, rows: &[Row]) -> Result<()> 
 }
 
 /// Age of the newest feature map at every millisecond from the first arrival to the last offer.
-fn ages_ms(seen: &Seen) -> Vec<f64> {
-    let end_nanos = seen.offers.last().map_or(0, |offer| offer.capture_nanos);
+fn ages_ms(seen: &Measurement) -> Vec<f64> {
+    let end_nanos = seen.submissions.last().map_or(0, |submit| submit.capture_nanos);
     let mut arrivals = seen.arrivals.iter().peekable();
     let mut newest_nanos = 0;
     let mut ages = Vec::new();
@@ -168,7 +168,7 @@ fn ages_ms(seen: &Seen) -> Vec<f64> {
 }
 
 /// Between the first arrival and the last.
-fn throughput_mbps(seen: &Seen) -> f64 {
+fn throughput_mbps(seen: &Measurement) -> f64 {
     let [Some(first), Some(last)] = [seen.arrivals.first(), seen.arrivals.last()] else { return 0.0 };
     let bytes: u64 = seen.arrivals[1..].iter().map(|arrival| arrival.bytes).sum();
     let ms = millis(first.nanos, last.nanos);

@@ -21,7 +21,7 @@ const PERIOD_MS: u64 = 100;
 /// Number of results in a row with every vehicle's data, after which the fleet has recovered.
 const SETTLED: usize = 5;
 /// Longest time until then.
-const PATIENCE: Duration = Duration::from_secs(60);
+const TIMEOUT: Duration = Duration::from_secs(60);
 /// Longest time that the router waits for a receiver that reads nothing.
 const STALL: Duration = Duration::from_millis(50);
 /// Age at which a process has opened all its descriptors.
@@ -55,7 +55,7 @@ pub struct Report {
     /// True if the ledgers of all processes balance.
     pub balances: bool,
     /// Description of the discrepancies.
-    pub differences: String,
+    pub discrepancies: String,
     /// Number of messages that are exempt, as a process that they concern was offline.
     pub exempted: u64,
     /// From Ctrl-C to the end.
@@ -180,7 +180,7 @@ impl FaultyFleet {
     /// Waits until results published after `after_ms` have every vehicle's data again; `gone` is a process that has to
     /// be restarted, with its previous id.
     fn settle(&mut self, after_ms: u64, gone: Option<(&str, u32)>, what: &str) -> std::result::Result<(), String> {
-        let deadline = Instant::now() + PATIENCE;
+        let deadline = Instant::now() + TIMEOUT;
         loop {
             let is_back = gone.is_none_or(|(name, pid)| self.up.pids().get(name).is_some_and(|now| *now != pid));
             // A feature map of the previous instance may be recent enough for a while.
@@ -240,7 +240,7 @@ impl FaultyFleet {
             findings: self.findings.clone(),
             slowest,
             balances: ledger["balances"] == true,
-            differences: ledger["balance"].to_string(),
+            discrepancies: ledger["balance"].to_string(),
             exempted: ledger["exempted"].as_u64().unwrap_or(0),
             stop,
             left_over: shared_memory().difference(&self.shared_memory).cloned().collect(),

@@ -19,7 +19,7 @@ pub struct Proxy {
     /// Endpoint for the processes.
     pub endpoint: Endpoint,
     port: u16,
-    cables: Arc<Mutex<Vec<VirtualLink>>>,
+    links: Arc<Mutex<Vec<VirtualLink>>>,
 }
 
 /// A connection of one process.
@@ -39,35 +39,35 @@ impl Proxy {
     pub fn open(router_port: u16) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").expect("a free port");
         let port = listener.local_addr().expect("a bound socket has an address").port();
-        let cables = Arc::<Mutex<Vec<VirtualLink>>>::default();
-        let laid = Arc::clone(&cables);
+        let links = Arc::<Mutex<Vec<VirtualLink>>>::default();
+        let laid = Arc::clone(&links);
         thread::spawn(move || {
             for process in listener.incoming().flatten() {
                 // Without a router the connection is closed; the process will try again.
                 let Ok(router) = TcpStream::connect(("127.0.0.1", router_port)) else { continue };
-                if let Some(cable) = lay(process, router) {
+                if let Some(link) = lay(process, router) {
                     let mut laid = laid.lock().unwrap_or_else(PoisonError::into_inner);
-                    laid.push(cable);
+                    laid.push(link);
                 }
             }
         });
-        Self { endpoint: Endpoint::loopback(port), port, cables }
+        Self { endpoint: Endpoint::loopback(port), port, links }
     }
 
     /// Cuts the links of a process; returns their number.
     pub fn cut(&self, pid: u32) -> usize {
-        self.each(pid, |cable| cable.ends.iter().for_each(|end| drop(end.shutdown(Shutdown::Both))))
+        self.each(pid, |link| link.ends.iter().for_each(|end| drop(end.shutdown(Shutdown::Both))))
     }
 
     /// Silences a process's links, or ends that; returns their number.
     pub fn silence(&self, pid: u32, is_silent: bool) -> usize {
-        self.each(pid, |cable| cable.is_silent.store(is_silent, Ordering::Relaxed))
+        self.each(pid, |link| link.is_silent.store(is_silent, Ordering::Relaxed))
     }
 
     fn each(&self, pid: u32, act: impl Fn(&VirtualLink)) -> usize {
         let ports = ports_of(pid, self.port);
-        let cables = self.cables.lock().unwrap_or_else(PoisonError::into_inner);
-        cables.iter().filter(|cable| ports.contains(&cable.port)).map(act).count()
+        let links = self.links.lock().unwrap_or_else(PoisonError::into_inner);
+        links.iter().filter(|link| ports.contains(&link.port)).map(act).count()
     }
 }
 

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use bus::bounded_queue::Pop;
 use bus::{Barrier, Bus, Event, Inbox, InboxLimits, PublisherOptions, Route};
 use protocol::{Account, DropReason, Lidar, Limits, PointCloud, Topic};
-use tests::bus::{PATIENCE, TestRouter, wait_for};
+use tests::bus::{TIMEOUT, TestRouter, wait_for};
 
 const HONEST: u64 = 20;
 
@@ -21,17 +21,17 @@ fn sweep(points: usize) -> Lidar {
 
 fn connect(sender: &Bus, ego: &Bus, topic: &Topic) {
     let route = Route { topic: topic.clone(), receiver: ego.identity().process.clone() };
-    Barrier::new([route]).await_routes(sender).unwrap().wait(PATIENCE).unwrap();
+    Barrier::new([route]).await_routes(sender).unwrap().wait(TIMEOUT).unwrap();
 }
 
 /// Receives until every message of the honest sender has arrived; the number of both senders' messages.
 fn receive(inbox: &Inbox, bus: &Bus) -> [u64; 2] {
-    let (mut received, deadline) = ([0; 2], Instant::now() + PATIENCE);
+    let (mut received, deadline) = ([0; 2], Instant::now() + TIMEOUT);
     while received[0] < HONEST {
         match inbox.take(Some(deadline)) {
             Pop::Item(topic, Event::Message(arrival)) => {
                 arrival.decode::<Lidar>(&Limits::DEFAULT).unwrap();
-                bus.books().received(&topic);
+                bus.stats().received(&topic);
                 received[usize::from(topic.to_string() != "1/lidar")] += 1;
             }
             Pop::Item(..) => {}
@@ -60,7 +60,7 @@ fn a_flood_from_one_peer_costs_the_others_nothing() {
         let (is_over, sent) = (Arc::clone(&is_over), Arc::clone(&sent));
         move || {
             while !is_over.load(Ordering::Relaxed) {
-                flood.offer(0, sweep(4096));
+                flood.submit(0, sweep(4096));
                 sent.fetch_add(1, Ordering::Relaxed);
             }
             flood.finish();
@@ -71,7 +71,7 @@ fn a_flood_from_one_peer_costs_the_others_nothing() {
     let began = Instant::now();
     let calm_sender = std::thread::spawn(move || {
         for tick in 0..HONEST {
-            calm.offer(tick, sweep(100));
+            calm.submit(tick, sweep(100));
             std::thread::sleep(Duration::from_millis(50));
         }
         calm.finish();
@@ -85,7 +85,7 @@ fn a_flood_from_one_peer_costs_the_others_nothing() {
     assert_eq!(calm, HONEST, "every message of the honest peer");
     let allowed = 20.0 * (seconds + 2.0 + 1.0);
     assert!((stormy as f64) < allowed, "{stormy} of {} were decoded in {seconds} s", sent.load(Ordering::Relaxed));
-    let ledger = ego.books().ledger();
+    let ledger = ego.stats().ledger();
     let counts = |topic| ledger.get(&Account::towards(topic, &ego.identity().process)).unwrap();
     assert_eq!(counts(good).dropped_total(), 0);
     assert!(counts(bad).dropped[&DropReason::RateLimit] > 100, "counted by its name");
@@ -102,10 +102,10 @@ fn what_waits_is_bounded_in_bytes() {
     let _subscription = ego.subscribe(topic.clone(), &inbox).unwrap();
     let publisher = sender.publisher(topic.clone(), PublisherOptions::FEATURES.lossless(4)).unwrap();
     connect(&sender, &ego, &topic);
-    (0..10).for_each(|tick| publisher.offer(tick, sweep(4096)));
+    (0..10).for_each(|tick| publisher.submit(tick, sweep(4096)));
     publisher.finish();
     let here = Account::towards(topic, &ego.identity().process);
-    let dropped = || ego.books().ledger().get(&here).map_or(0, |counts| counts.dropped_total());
+    let dropped = || ego.stats().ledger().get(&here).map_or(0, |counts| counts.dropped_total());
     wait_for("refusals", || dropped() == 8);
     assert!(inbox.waiting_bytes() <= 160_000, "{}", inbox.waiting_bytes());
     let taken = std::iter::from_fn(|| match inbox.take(Some(Instant::now())) {

@@ -9,7 +9,7 @@ use link::{CapacityConfig, DelayModel, DeviceClock, LinkConfig, LinkEmulator, Lo
 use protocol::message::Points;
 use protocol::{CavId, DropReason, Ledger, Limits, PointCloud, Pose, PoseEstimate, Role, Stream, Topic};
 use sim_replay::link_node::{self, LinkReport, NodeOptions};
-use tests::bus::{PATIENCE, TestRouter, next_event, wait_for};
+use tests::bus::{TIMEOUT, TestRouter, next_event, wait_for};
 
 /// Number of sweeps that are sent, and of their points: 16 kB each.
 const COUNT: u64 = 6;
@@ -24,7 +24,7 @@ fn points(tick: u64) -> Points {
     Points { pose: PoseEstimate::new(Pose::IDENTITY, 1.0), points: PointCloud { xyzi } }
 }
 
-/// Arrival time of each message after the first was offered, by capture time; the link's report; the sum of all
+/// Arrival time of each message after the first was submitted, by capture time; the link's report; the sum of all
 /// ledgers.
 struct Crossing {
     arrivals: Vec<(u64, Duration)>,
@@ -40,7 +40,7 @@ fn options() -> NodeOptions {
 /// Waits until a topic of the bus's process reaches a receiver.
 fn wait_for_route(bus: &Bus, topic: &Topic, receiver: &str) {
     let route = Route { topic: topic.clone(), receiver: receiver.parse().unwrap() };
-    Barrier::new([route]).await_routes(bus).unwrap().wait(PATIENCE).unwrap();
+    Barrier::new([route]).await_routes(bus).unwrap().wait(TIMEOUT).unwrap();
 }
 
 /// Sends all sweeps at once through a link.
@@ -63,7 +63,7 @@ fn cross(config: LinkConfig, options: &NodeOptions) -> Crossing {
         wait_for_route(&agent, &sent, "link-9");
         wait_for_route(&agent, &received, "ego-9");
         let began = std::time::Instant::now();
-        (0..COUNT).for_each(|tick| publisher.offer(tick, points(tick)));
+        (0..COUNT).for_each(|tick| publisher.submit(tick, points(tick)));
         publisher.finish();
         let mut arrivals = Vec::new();
         // The end of the agent's topic is forwarded to the ego.
@@ -71,7 +71,7 @@ fn cross(config: LinkConfig, options: &NodeOptions) -> Crossing {
             let stamp = &arrival.header.stamp;
             assert_eq!((&stamp.cav, stamp.sequence), (&cav("7"), arrivals.len() as u64));
             assert_eq!(inbox.decode::<Points>(&arrival, &Limits::DEFAULT).unwrap(), points(stamp.sequence));
-            ego.books().received(&received);
+            ego.stats().received(&received);
             arrivals.push((stamp.capture_nanos, arrival.at - began));
         }
         let report = carrying.join().unwrap();
@@ -79,7 +79,7 @@ fn cross(config: LinkConfig, options: &NodeOptions) -> Crossing {
         (arrivals, report)
     });
     let mut ledger = Ledger::default();
-    [&agent, &link, &ego].iter().for_each(|bus| ledger.merge(&bus.books().ledger()));
+    [&agent, &link, &ego].iter().for_each(|bus| ledger.merge(&bus.stats().ledger()));
     assert!(ledger.balance().is_exact(), "{:?}", ledger.balance());
     Crossing { arrivals, report, ledger }
 }
@@ -95,7 +95,7 @@ fn messages_come_late_in_order_and_unchanged() {
         let earliest = Duration::from_millis(16 * (tick + 1) + 30);
         assert!(*late >= earliest, "{tick} came after {late:?}, its bits take {earliest:?}");
     }
-    assert_eq!((report.offered, report.arrived, report.under_way), (COUNT, COUNT, 0));
+    assert_eq!((report.submitted, report.arrived, report.under_way), (COUNT, COUNT, 0));
     assert_eq!((ledger.total().sent, ledger.total().received), (2 * COUNT, 2 * COUNT));
 }
 
@@ -125,7 +125,7 @@ fn a_long_delay_keeps_no_more_than_it_may() {
     let room_for_two = NodeOptions { max_kept_bytes: 40_000, ..options() };
     let Crossing { arrivals, report, ledger } = cross(config, &room_for_two);
     assert_eq!(arrivals.iter().map(|(tick, _)| *tick).collect::<Vec<_>>(), [0, 1]);
-    assert_eq!((report.offered, report.arrived), (COUNT, 2));
+    assert_eq!((report.submitted, report.arrived), (COUNT, 2));
     assert_eq!(report.dropped, [(DropReason::LinkQueue, COUNT - 2)].into());
     assert_eq!(ledger.total().dropped[&DropReason::LinkQueue], COUNT - 2);
 }
@@ -145,14 +145,14 @@ fn a_link_that_carries_nothing_reports_it() {
         let _presence = agent.announce(Role::Agent).unwrap();
         let publisher = agent.publisher(sent.clone(), PublisherOptions::FEATURES.lossless(16)).unwrap();
         wait_for_route(&agent, &sent, "link-9");
-        (0..COUNT).for_each(|tick| publisher.offer(tick, points(tick)));
+        (0..COUNT).for_each(|tick| publisher.submit(tick, points(tick)));
         publisher.finish();
         // Longer than any useful message is in flight.
         std::thread::sleep(Duration::from_millis(5_500));
         stop.request();
         carrying.join().unwrap()
     });
-    assert_eq!((report.offered, report.arrived, report.under_way), (COUNT, 0, COUNT), "{report:?}");
+    assert_eq!((report.submitted, report.arrived, report.under_way), (COUNT, 0, COUNT), "{report:?}");
     assert!(report.longest_ms > 5_000 && !report.is_complete(), "{report:?}");
 }
 
@@ -169,15 +169,15 @@ fn a_flood_is_limited_before_the_link() {
         let _presence = agent.announce(Role::Agent).unwrap();
         let publisher = agent.publisher(sent.clone(), PublisherOptions::FEATURES.lossless(16)).unwrap();
         wait_for_route(&agent, &sent, "link-9");
-        (0..COUNT).for_each(|tick| publisher.offer(tick, points(tick)));
+        (0..COUNT).for_each(|tick| publisher.submit(tick, points(tick)));
         publisher.finish();
         let refused =
-            || link.books().ledger().total().dropped.get(&DropReason::RateLimit).is_some_and(|count| *count > 0);
+            || link.stats().ledger().total().dropped.get(&DropReason::RateLimit).is_some_and(|count| *count > 0);
         wait_for("a refusal", refused);
         stop.request();
         carrying.join().unwrap()
     });
-    assert!(report.offered < COUNT, "{report:?}");
+    assert!(report.submitted < COUNT, "{report:?}");
 }
 
 #[test]
@@ -202,22 +202,22 @@ fn an_agent_that_comes_back_is_carried_again() {
             let publisher = agent.publisher(sent.clone(), PublisherOptions::FEATURES.lossless(16)).unwrap();
             wait_for_route(&agent, &sent, "link-9");
             wait_for_route(&agent, &received, "ego-9");
-            ticks.clone().for_each(|tick| publisher.offer(tick, points(tick)));
+            ticks.clone().for_each(|tick| publisher.submit(tick, points(tick)));
             publisher.finish();
             for tick in ticks {
                 let (_, Event::Message(arrival)) = next_event(&inbox) else { panic!("{tick} does not come") };
                 assert_eq!(inbox.decode::<Points>(&arrival, &Limits::DEFAULT).unwrap(), points(tick));
-                ego.books().received(&received);
+                ego.stats().received(&received);
             }
             presence.withdraw().unwrap();
-            ledger.merge(&agent.books().ledger());
-            agent.leave(PATIENCE).unwrap();
+            ledger.merge(&agent.stats().ledger());
+            agent.leave(TIMEOUT).unwrap();
         }
         presence.withdraw().unwrap();
         let report = carrying.join().unwrap();
-        assert_eq!((report.offered, report.arrived, report.under_way), (6, 6, 0));
+        assert_eq!((report.submitted, report.arrived, report.under_way), (6, 6, 0));
         assert!(matches!(next_event(&inbox).1, Event::End { sent: 6, .. }));
     });
-    [&link, &ego].iter().for_each(|bus| ledger.merge(&bus.books().ledger()));
+    [&link, &ego].iter().for_each(|bus| ledger.merge(&bus.stats().ledger()));
     assert!(ledger.balance().is_exact(), "{:?}", ledger.balance());
 }

@@ -10,7 +10,7 @@ use bus::{Bus, Event, Inbox, PublisherOptions, Subscription, bounded_queue::Pop}
 use dataset::{self, Scenario};
 use protocol::{CavId, Control, Gnss, KeyExpr, Lidar, Limits, Stream, Topic, Truth, wire};
 use sim_replay::stream::{Replay, StreamError, StreamOptions, StreamReport};
-use tests::bus::{PATIENCE, TestRouter, next_event, wait_for};
+use tests::bus::{TIMEOUT, TestRouter, next_event, wait_for};
 use tests::scene;
 
 const AGENTS: [&str; 2] = ["10", "20"];
@@ -68,7 +68,7 @@ fn play_until(router: &TestRouter, scenario: &Scenario, options: StreamOptions, 
     let replay = Replay::prepare(&bus, scenario, options, stop).unwrap();
     replay.wait_until_ready().unwrap();
     let report = replay.play();
-    bus.leave(PATIENCE).unwrap();
+    bus.leave(TIMEOUT).unwrap();
     report
 }
 
@@ -188,9 +188,9 @@ fn pause_step_seek_and_resume_steer_the_clock() {
         });
         // While ticks arrive, the replay receives: its subscriptions were sent before them.
         while next_truth().0 < 2 {}
-        operator.say(Control::Pause, 0);
-        operator.say(Control::Seek { tick: 6 }, 0);
-        operator.say(Control::Step { ticks: 1 }, 0);
+        operator.publish_control(Control::Pause, 0);
+        operator.publish_control(Control::Seek { tick: 6 }, 0);
+        operator.publish_control(Control::Step { ticks: 1 }, 0);
         // Any tick before 6 was published before the pause arrived.
         let capture = loop {
             let (index, capture) = next_truth();
@@ -200,11 +200,11 @@ fn pause_step_seek_and_resume_steer_the_clock() {
             assert!(index < 6, "{index}");
         };
         assert_eq!(capture, recorded[6]);
-        operator.say(Control::Step { ticks: 2 }, 0);
+        operator.publish_control(Control::Step { ticks: 2 }, 0);
         assert_eq!([next_truth().0, next_truth().0], [7, 0]);
-        operator.say(Control::Seek { tick: 99 }, 0);
-        operator.say(Control::Seek { tick: 4 }, 0);
-        operator.say(Control::Resume, 0);
+        operator.publish_control(Control::Seek { tick: 99 }, 0);
+        operator.publish_control(Control::Seek { tick: 4 }, 0);
+        operator.publish_control(Control::Resume, 0);
         let (index, capture) = next_truth();
         assert_eq!(index, 4);
         assert!(capture > recorded[7], "time goes on over a jump back");
@@ -219,8 +219,8 @@ fn a_restarted_replay_resumes_and_does_not_wait_for_offline_agents() {
     let folder = tempfile::tempdir().unwrap();
     scene::write(folder.path(), &AGENTS, 12);
     let (router, scenario) = (TestRouter::open(), scenario(folder.path()));
-    let bookmark = folder.path().join("replay.json");
-    let options = StreamOptions { rate: 4.0, bookmark: Some(bookmark.clone()), ..StreamOptions::default() };
+    let checkpoint = folder.path().join("replay.json");
+    let options = StreamOptions { rate: 4.0, checkpoint: Some(checkpoint.clone()), ..StreamOptions::default() };
     let (listener, stop) = (Listener::new(&router), Stop::new());
     let next_truth = || loop {
         if let (Topic::Truth, Event::Message(arrival)) = next_event(&listener.inbox) {
@@ -244,7 +244,7 @@ fn a_restarted_replay_resumes_and_does_not_wait_for_offline_agents() {
     assert_eq!((seen, report.ticks), (recorded, 12));
     assert_eq!(play(&router, &scenario, options.clone()).ticks, 12, "there is nothing left to play");
 
-    std::fs::write(&bookmark, "{}").unwrap();
+    std::fs::write(&checkpoint, "{}").unwrap();
     let bus = router.join("replay", "replay");
     let error = Replay::prepare(&bus, &scenario, options, &Stop::new()).err().unwrap().to_string();
     assert!(error.contains("replay.json: not a replay checkpoint: missing field"), "{error}");
@@ -260,7 +260,7 @@ fn an_agent_that_does_not_come_is_named() {
     let _subscriptions =
         [Stream::Lidar, Stream::Gnss].map(|stream| agent.subscribe(topic("10", stream), &inbox).unwrap());
     let bus = router.join("replay", "replay");
-    let options = StreamOptions { patience: Duration::from_millis(400), ..StreamOptions::default() };
+    let options = StreamOptions { timeout: Duration::from_millis(400), ..StreamOptions::default() };
     let replay = Replay::prepare(&bus, &scenario, options, &Stop::new()).unwrap();
     let error = replay.wait_until_ready().unwrap_err().to_string();
     assert!(error.contains("20/lidar>agent-20, 20/gnss>agent-20") && !error.contains("10/"), "{error}");

@@ -11,7 +11,7 @@ use protocol::{
     Account, CavId, Control, DropReason, Gnss, GnssSource, Ledger, Lidar, Limits, PointCloud, Pose, Role, Stamp,
     Stream, Topic,
 };
-use tests::bus::{PATIENCE, TestRouter, free_port, next_event, wait_for};
+use tests::bus::{TIMEOUT, TestRouter, free_port, next_event, wait_for};
 use zenoh::Wait;
 use zenoh::qos::CongestionControl;
 
@@ -41,12 +41,12 @@ fn sweep(count: u16) -> Lidar {
 fn connect(publisher: &Bus, receiver: &Bus, topic: &Topic) {
     let route = Route { topic: topic.clone(), receiver: receiver.identity().process.clone() };
     let barrier = Barrier::new([route]);
-    barrier.await_routes(publisher).unwrap().wait(PATIENCE).unwrap();
+    barrier.await_routes(publisher).unwrap().wait(TIMEOUT).unwrap();
 }
 
 fn balanced(buses: &[&Bus]) -> Ledger {
     let mut ledger = Ledger::default();
-    buses.iter().for_each(|bus| ledger.merge(&bus.books().ledger()));
+    buses.iter().for_each(|bus| ledger.merge(&bus.stats().ledger()));
     assert!(ledger.balance().is_exact(), "{:?}", ledger.balance());
     ledger
 }
@@ -63,7 +63,7 @@ fn one_publisher_reaches_every_subscriber() {
         receivers.iter().zip(&inboxes).map(|(bus, inbox)| bus.subscribe(topic.clone(), inbox).unwrap()).collect();
     receivers.iter().for_each(|bus| connect(&replay, bus, &topic));
 
-    (0..20).for_each(|tick| publisher.offer(tick, sweep(40_000 + tick as u16)));
+    (0..20).for_each(|tick| publisher.submit(tick, sweep(40_000 + tick as u16)));
     publisher.finish();
 
     for (bus, inbox) in receivers.iter().zip(&inboxes) {
@@ -72,7 +72,7 @@ fn one_publisher_reaches_every_subscriber() {
             let lidar: Lidar = inbox.decode(&arrival, &Limits::DEFAULT).unwrap();
             assert_eq!((arrival.header.stamp.sequence, arrival.header.stamp.capture_nanos), (tick, tick));
             assert_eq!(lidar, sweep(40_000 + tick as u16));
-            bus.books().received(&topic);
+            bus.stats().received(&topic);
         }
         assert!(matches!(next_event(inbox), (_, Event::End { sent: 20, .. })));
     }
@@ -97,8 +97,8 @@ fn no_first_frame_is_lost_in_twenty_cold_starts() {
             move || {
                 let publisher = replay.publisher(topic.clone(), PublisherOptions::SENSOR.lossless(8)).unwrap();
                 let route = Route { topic, receiver: "agent-7".parse().unwrap() };
-                Barrier::new([route]).await_routes(&replay).unwrap().wait(PATIENCE).unwrap();
-                (0..5).for_each(|tick| publisher.offer(tick, gnss(tick as f64)));
+                Barrier::new([route]).await_routes(&replay).unwrap().wait(TIMEOUT).unwrap();
+                (0..5).for_each(|tick| publisher.submit(tick, gnss(tick as f64)));
                 publisher.finish();
                 replay
             }
@@ -108,8 +108,8 @@ fn no_first_frame_is_lost_in_twenty_cold_starts() {
             let (_, Event::Message(arrival)) = next_event(&inbox) else { panic!("an end before the last message") };
             assert_eq!(arrival.header.stamp.capture_nanos, tick);
         }
-        starting.join().unwrap().leave(PATIENCE).unwrap();
-        agent.leave(PATIENCE).unwrap();
+        starting.join().unwrap().leave(TIMEOUT).unwrap();
+        agent.leave(TIMEOUT).unwrap();
     }
 }
 
@@ -119,8 +119,8 @@ fn a_process_with_a_stalled_worker_stops_its_heartbeat() {
     let (agent, watcher) = (router.join("agent-7", "7"), router.join("watcher", "watcher"));
     let heartbeats = watcher.inbox(64, 4);
     let _subscription = watcher.subscribe(topic("stats/agent-7"), &heartbeats).unwrap();
-    let reports = |patience: Duration| matches!(heartbeats.take(Some(Instant::now() + patience)), Pop::Item(..));
-    assert!(reports(PATIENCE), "a heartbeat");
+    let reports = |timeout: Duration| matches!(heartbeats.take(Some(Instant::now() + timeout)), Pop::Item(..));
+    assert!(reports(TIMEOUT), "a heartbeat");
 
     let inbox = agent.inbox(1, 1);
     let working = agent.works_from(&inbox);
@@ -131,11 +131,11 @@ fn a_process_with_a_stalled_worker_stops_its_heartbeat() {
     reports(Duration::from_millis(700));
     assert!(!reports(Duration::from_millis(1500)), "a heartbeat although its worker is stalled");
     working.beat();
-    assert!(reports(PATIENCE), "its worker was active");
+    assert!(reports(TIMEOUT), "its worker was active");
     drop(working);
-    assert!((0..3).all(|_| reports(PATIENCE)), "its work is done: heartbeats as before");
-    agent.leave(PATIENCE).unwrap();
-    watcher.leave(PATIENCE).unwrap();
+    assert!((0..3).all(|_| reports(TIMEOUT)), "its work is done: heartbeats as before");
+    agent.leave(TIMEOUT).unwrap();
+    watcher.leave(TIMEOUT).unwrap();
 }
 
 #[test]
@@ -160,7 +160,7 @@ fn a_process_reports_only_its_own_routes() {
     let mut report_ready = |process: &str| {
         let stamp = Stamp { cav: cav("8"), epoch: u64::MAX, sequence, capture_nanos: 0, publish_nanos: 0 };
         sequence += 1;
-        let ready = Control::Ready { process: process.parse().unwrap(), heard: vec![topic("7/lidar")] };
+        let ready = Control::Ready { process: process.parse().unwrap(), subscribed: vec![topic("7/lidar")] };
         let bytes = protocol::wire::encode(&stamp, ready).unwrap().to_vec();
         agent.session().put(&key, bytes).congestion_control(CongestionControl::Block).wait().unwrap();
     };
@@ -182,17 +182,17 @@ fn a_slow_consumer_gets_the_newest_and_every_loss_is_counted() {
     let inbox = agent.inbox(1, 1);
     let _subscription = agent.subscribe(topic.clone(), &inbox).unwrap();
     connect(&replay, &agent, &topic);
-    (0..10).for_each(|tick| publisher.offer(tick, sweep(1000)));
+    (0..10).for_each(|tick| publisher.submit(tick, sweep(1000)));
     publisher.finish();
     // The consumer reads only now, when all have arrived.
     let account = Account::towards(topic.clone(), &agent.identity().process);
     wait_for("nine superseded", || {
-        let ledger = agent.books().ledger();
+        let ledger = agent.stats().ledger();
         ledger.get(&account).is_some_and(|counts| counts.dropped.get(&DropReason::Superseded) == Some(&9))
     });
     let (_, Event::Message(arrival)) = next_event(&inbox) else { panic!("an end before the message") };
     assert_eq!(arrival.header.stamp.capture_nanos, 9);
-    agent.books().received(&topic);
+    agent.stats().received(&topic);
     assert!(matches!(next_event(&inbox), (_, Event::End { sent: 10, .. })), "a notice never takes the place of data");
     balanced(&[&replay, &agent]);
 }
@@ -212,16 +212,16 @@ fn an_overloaded_publisher_returns_at_once_and_counts() {
         .enumerate()
         .map(|(tick, cloud)| {
             let began = Instant::now();
-            publisher.offer(tick as u64, cloud);
+            publisher.submit(tick as u64, cloud);
             began.elapsed()
         })
         .max()
         .unwrap();
-    assert!(longest < Duration::from_millis(50), "an offer took {longest:?}");
+    assert!(longest < Duration::from_millis(50), "an submit took {longest:?}");
     publisher.finish();
     let mut last = None;
     while let Event::Message(arrival) = next_event(&inbox).1 {
-        agent.books().received(&topic);
+        agent.stats().received(&topic);
         last = Some(arrival.header.stamp.capture_nanos);
     }
     assert_eq!(last, Some(49), "the newest is never the one that is dropped");
@@ -243,25 +243,25 @@ fn a_late_joiner_is_detected_receives_and_its_end_is_detected() {
             let _ = report.send(event);
         })
         .unwrap();
-    let seen = |event: LivelinessEvent| assert_eq!(events.recv_timeout(PATIENCE).unwrap(), event);
-    seen(LivelinessEvent::Appeared { role: Role::Agent, cav: cav("1") });
+    let seen = |event: LivelinessEvent| assert_eq!(events.recv_timeout(TIMEOUT).unwrap(), event);
+    seen(LivelinessEvent::Joined { role: Role::Agent, cav: cav("1") });
 
     let late = router.join("agent-2", "2");
     let presence = late.announce(Role::Agent).unwrap();
-    seen(LivelinessEvent::Appeared { role: Role::Agent, cav: cav("2") });
+    seen(LivelinessEvent::Joined { role: Role::Agent, cav: cav("2") });
     let topic = topic("2/gnss");
     let inbox = ego.inbox(4, 4);
     let _subscription = ego.subscribe(topic.clone(), &inbox).unwrap();
     let publisher = late.publisher(topic.clone(), PublisherOptions::POSE).unwrap();
     connect(&late, &ego, &topic);
-    publisher.offer(3, gnss(1.0));
+    publisher.submit(3, gnss(1.0));
     assert!(matches!(next_event(&inbox), (found, Event::Message(_)) if found == topic));
 
     presence.withdraw().unwrap();
-    seen(LivelinessEvent::Vanished { role: Role::Agent, cav: cav("2") });
+    seen(LivelinessEvent::Left { role: Role::Agent, cav: cav("2") });
     // A crashed one is detected as well.
     early.session().close().wait().unwrap();
-    seen(LivelinessEvent::Vanished { role: Role::Agent, cav: cav("1") });
+    seen(LivelinessEvent::Left { role: Role::Agent, cav: cav("1") });
 }
 
 #[test]
@@ -304,24 +304,24 @@ fn wrong_bytes_are_counted_and_survived() {
     for bytes in hostile {
         enemy.session().put(&key, bytes).congestion_control(CongestionControl::Block).wait().unwrap();
     }
-    enemy.leave(PATIENCE).unwrap();
+    enemy.leave(TIMEOUT).unwrap();
 
-    publisher.offer(5, gnss(5.0));
+    publisher.submit(5, gnss(5.0));
     let account = Account::towards(topic.clone(), &ego.identity().process);
     let mut sound_messages = 0;
-    while sound_messages == 0 || ego.books().ledger().get(&account).unwrap().dropped_total() < count {
-        match inbox.take(Some(Instant::now() + PATIENCE)) {
+    while sound_messages == 0 || ego.stats().ledger().get(&account).unwrap().dropped_total() < count {
+        match inbox.take(Some(Instant::now() + TIMEOUT)) {
             Pop::Item(_, Event::Message(arrival)) => {
                 if let Some(gnss) = inbox.decode::<Gnss>(&arrival, &Limits::DEFAULT) {
                     assert_eq!(gnss.world_from_lidar.translation_m[0], 5.0);
-                    ego.books().received(&topic);
+                    ego.stats().received(&topic);
                     sound_messages += 1;
                 }
             }
             other => panic!("{other:?}"),
         }
     }
-    let counts = ego.books().ledger().get(&account).unwrap().clone();
+    let counts = ego.stats().ledger().get(&account).unwrap().clone();
     assert_eq!((counts.received, counts.in_flight), (1, 0));
     let dropped = |reason| counts.dropped.get(&reason).copied().unwrap_or(0);
     assert_eq!(dropped(DropReason::Version), 1);
@@ -340,7 +340,7 @@ fn a_port_in_use_and_a_missing_router_are_named() {
 
     let nowhere = Endpoint::loopback(free_port());
     let mut options = BusOptions::client(nowhere.clone());
-    options.patience = Duration::from_millis(300);
+    options.timeout = Duration::from_millis(300);
     let error = bus::open(&options).unwrap_err();
     assert!(matches!(&error, BusError::Unreachable { endpoint, .. } if *endpoint == nowhere), "{error}");
     assert!(error.to_string().contains(nowhere.as_str()) && error.to_string().contains("start it first"), "{error}");
@@ -369,9 +369,9 @@ fn what_was_sent_before_leaving_arrives() {
         let subscription = ego.subscribe(topic.clone(), &inbox).unwrap();
         let publisher = agent.publisher(topic.clone(), PublisherOptions::SENSOR.lossless(8)).unwrap();
         connect(&agent, &ego, &topic);
-        (0..5).for_each(|tick| publisher.offer(tick, sweep(50_000)));
+        (0..5).for_each(|tick| publisher.submit(tick, sweep(50_000)));
         publisher.finish();
-        agent.leave(PATIENCE).unwrap();
+        agent.leave(TIMEOUT).unwrap();
         for _ in 0..5 {
             assert!(matches!(next_event(&inbox).1, Event::Message(_)), "round {round}");
         }
@@ -398,13 +398,13 @@ fn shared_memory_carries_the_same_messages() {
     let inbox = agent.inbox(64, 1);
     let _subscription = agent.subscribe(topic.clone(), &inbox).unwrap();
     connect(&replay, &agent, &topic);
-    (0..20).for_each(|tick| publisher.offer(tick, sweep(60_000)));
+    (0..20).for_each(|tick| publisher.submit(tick, sweep(60_000)));
     publisher.finish();
     for tick in 0..20 {
         let (_, Event::Message(arrival)) = next_event(&inbox) else { panic!("an end before the last message") };
         assert_eq!(arrival.header.stamp.capture_nanos, tick);
         assert_eq!(inbox.decode::<Lidar>(&arrival, &Limits::DEFAULT), Some(sweep(60_000)));
-        agent.books().received(&topic);
+        agent.stats().received(&topic);
     }
     balanced(&[&replay, &agent]);
 }

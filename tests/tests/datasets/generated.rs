@@ -12,7 +12,7 @@ use nalgebra::Point3;
 use simulator::generate::lidar::LIDAR_MOUNT_M;
 use simulator::generate::radar::red_to_velocity;
 use simulator::generate::{Subset, Summary, SynthError, SynthOptions, Weather, generate};
-use simulator::map::TownSource;
+use simulator::map::RoadMapSource;
 
 fn v2vdet(seed: u64, out: &Path) -> SynthOptions {
     SynthOptions { frames: 3, agents: 2..=3, ..SynthOptions::new(Subset::V2vdet, seed, out.to_owned()) }
@@ -289,7 +289,7 @@ fn bad_options_are_named() {
     assert_eq!(agents, "--agents is 4-2; expected a number or a range within 1-7");
     let copies = message(SynthOptions { copies: vec![Weather::Sunny], ..v2vdet(1, folder.path()) });
     assert_eq!(copies, "--copies is sunny; expected fog, snow or both");
-    let town = Some(TownSource::OpenDrive("no/such/map.xodr".into()));
+    let town = Some(RoadMapSource::OpenDrive("no/such/map.xodr".into()));
     let missing = message(SynthOptions { town, ..v2vdet(1, folder.path()) });
     assert!(missing.contains("no/such/map.xodr"), "{missing}");
 }

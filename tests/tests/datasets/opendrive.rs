@@ -2,7 +2,7 @@
 
 use simulator::map::lane_builder::lane_graph;
 use simulator::map::road::RoadNetwork;
-use simulator::map::{LaneGraph, TownSource, build, opendrive};
+use simulator::map::{LaneGraph, RoadMapSource, build, opendrive};
 use tests::fixtures;
 
 /// Distance that a vehicle should be able to drive from a lane, metres.
@@ -100,17 +100,17 @@ fn check_links(file: &str, graph: &LaneGraph) {
 fn maps_become_towns_with_free_lanes_the_same_every_time() {
     let folder = fixtures::data("opendrive");
     for expected in MAPS {
-        let source = TownSource::OpenDrive(folder.join(expected.file));
-        let (town, again) = (build(&source, 3).unwrap(), build(&source, 3).unwrap());
-        assert!(town == again, "{} differs from itself", expected.file);
-        let found = town.obstructions();
-        let first = found.first().map(|&(lane, solid)| (lane, town.solids[solid]));
+        let source = RoadMapSource::OpenDrive(folder.join(expected.file));
+        let (map_model, again) = (build(&source, 3).unwrap(), build(&source, 3).unwrap());
+        assert!(map_model == again, "{} differs from itself", expected.file);
+        let found = map_model.obstructions();
+        let first = found.first().map(|&(lane, solid)| (lane, map_model.solids[solid]));
         assert!(found.is_empty(), "{}: {} lanes obstructed, such as {first:?}", expected.file, found.len());
-        assert!(town.solids.len() > 2000 && town.parking.len() > 50);
+        assert!(map_model.solids.len() > 2000 && map_model.parking.len() > 50);
         // The ground meets the lanes, except where they pass above it.
         let (mut below, mut points) = (0u32, 0u32);
-        for point in town.lanes.lanes.iter().flat_map(|lane| &lane.centerline) {
-            let ground = town.ground.height_m(point[0], point[1]);
+        for point in map_model.lanes.lanes.iter().flat_map(|lane| &lane.centerline) {
+            let ground = map_model.ground.height_m(point[0], point[1]);
             assert!(
                 ground < point[2] + 0.3,
                 "{}: the ground is {} m over a lane at {point:?}",

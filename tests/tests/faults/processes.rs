@@ -19,7 +19,7 @@ fn a_fleet_gets_over_a_dozen_faults() {
     }
     let report = FaultyFleet::start(folder.path())
         .suffer(&faults, |number, fault, ms| eprintln!("{number}: {fault}, as before after {ms} ms"));
-    assert!(report.balances, "{}", report.differences);
+    assert!(report.balances, "{}", report.discrepancies);
     assert!(report.left_over.is_empty(), "{:?}", report.left_over);
     assert!(report.restarts > 0, "{report:?}");
     // `u64::MAX` stands for never. Times are measured by `cargo bench -p tests --bench faults`.

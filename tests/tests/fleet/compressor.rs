@@ -23,7 +23,7 @@ use protocol::message::Bev;
 use protocol::{CavId, DecodedFeatures, Detection, Detections, DropReason, HEADER_LEN, Ledger, Limits, Stream, Topic};
 use sim_replay::stream::{Replay, StreamOptions};
 use tch::{Device, Kind, Tensor, no_grad};
-use tests::bus::{PATIENCE, TestRouter};
+use tests::bus::{TIMEOUT, TestRouter};
 use tests::scene;
 
 const AGENTS: [&str; 2] = ["10", "20"];
@@ -107,17 +107,17 @@ fn live(folder: &Path, weights: &Path, of_neighbour: &Path) -> (Vec<Detections>,
             scope.spawn(move || {
                 let bus = router.join(&format!("agent-{name}"), name);
                 agent_node::run(&bus, agent, &agent_node::NodeOptions::default(), &stop).unwrap();
-                bus.leave(PATIENCE).unwrap();
+                bus.leave(TIMEOUT).unwrap();
             });
         }
         let (own_stop, ego) = (stop.clone(), Ego::load(weights, None).unwrap());
         let router = &router;
         let ego = scope.spawn(move || {
             let bus = router.join("ego-10", "10");
-            let options = ego_node::NodeOptions { deadline: PATIENCE, ..ego_node::NodeOptions::default() };
+            let options = ego_node::NodeOptions { deadline: TIMEOUT, ..ego_node::NodeOptions::default() };
             ego_node::run(&bus, &cav("10"), ego, &options, &own_stop).unwrap();
-            let stats = bus.books().clone();
-            bus.leave(PATIENCE).unwrap();
+            let stats = bus.stats().clone();
+            bus.leave(TIMEOUT).unwrap();
             stats.ledger()
         });
         let replay = router.join("replay", "replay");
@@ -132,14 +132,14 @@ fn live(folder: &Path, weights: &Path, of_neighbour: &Path) -> (Vec<Detections>,
         let playing = Replay::prepare(&replay, &scenario, options, &Stop::new()).unwrap();
         playing.wait_until_ready().unwrap();
         assert!(playing.play().is_complete());
-        replay.leave(PATIENCE).unwrap();
+        replay.leave(TIMEOUT).unwrap();
         let mut results = Vec::new();
         while results.len() < TICKS
-            && let Pop::Item(_, Event::Message(arrival)) = inbox.take(Some(Instant::now() + PATIENCE))
+            && let Pop::Item(_, Event::Message(arrival)) = inbox.take(Some(Instant::now() + TIMEOUT))
         {
             results.push(inbox.decode(&arrival, &Limits::DEFAULT).unwrap());
         }
-        scorer.leave(PATIENCE).unwrap();
+        scorer.leave(TIMEOUT).unwrap();
         (results, ego.join().unwrap())
     })
 }

@@ -31,7 +31,7 @@ use sim_replay::recorder::{self, RecordReport, RecorderOptions};
 use sim_replay::stream::{Replay, StreamOptions};
 use tch::Device;
 use tch::nn::VarStore;
-use tests::bus::{PATIENCE, TestRouter, next_event};
+use tests::bus::{TIMEOUT, TestRouter, next_event};
 use tests::locks::random_generator_lock;
 use tests::scene;
 use zenoh::Wait;
@@ -105,8 +105,8 @@ fn run_agent<'scope>(
 }
 
 fn leave(bus: Bus) -> Ledger {
-    let stats = bus.books().clone();
-    bus.leave(PATIENCE).unwrap();
+    let stats = bus.stats().clone();
+    bus.leave(TIMEOUT).unwrap();
     stats.ledger()
 }
 
@@ -122,10 +122,10 @@ fn collect<'scope>(
     scope.spawn(move || {
         let mut results = Vec::new();
         loop {
-            match inbox.take(Some(Instant::now() + PATIENCE)) {
+            match inbox.take(Some(Instant::now() + TIMEOUT)) {
                 Pop::Item(_, Event::Message(arrival)) => {
                     let result: Detections = inbox.decode(&arrival, &Limits::DEFAULT).unwrap();
-                    bus.books().received(&arrival.topic);
+                    bus.stats().received(&arrival.topic);
                     results.push((arrival.header.stamp.capture_nanos, result));
                 }
                 Pop::Item(_, Event::End { .. }) => break,
@@ -161,7 +161,7 @@ fn record<'scope>(
         let recording = RecordingOptions::default();
         let options = RecorderOptions { out, recording, without: Vec::new(), keeps_running: true };
         let report = recorder::record(&bus, &options, &stop, &mut |_| {}).unwrap();
-        bus.leave(PATIENCE).unwrap();
+        bus.leave(TIMEOUT).unwrap();
         report
     })
 }
@@ -187,7 +187,7 @@ fn play_and_record(
         let agents: Vec<_> = taking_part(method).iter().map(start).collect();
         let ego = scope.spawn(|| {
             let bus = router.join("ego-10", "10");
-            let options = ego_node::NodeOptions { deadline: PATIENCE, ..ego_node::NodeOptions::default() };
+            let options = ego_node::NodeOptions { deadline: TIMEOUT, ..ego_node::NodeOptions::default() };
             let report = ego_node::run(&bus, &cav("10"), ego(method), &options, &stop).unwrap();
             assert_eq!((report.frames, report.at_deadline, report.failed), (TICKS as u64, 0, 0));
             leave(bus)
@@ -362,7 +362,7 @@ impl ScriptedAgent {
         };
         let output = self.agent.process(&input).unwrap();
         let pose = output.pose;
-        self.publisher.offer_encoded(tick.capture_nanos, move |stamp| {
+        self.publisher.submit_encoded(tick.capture_nanos, move |stamp| {
             let features =
                 protocol::encode_features(output.perception.features, &protocol::CodecConfig::default(), None)?;
             protocol::wire::encode(stamp, protocol::message::Bev { pose, features })
@@ -371,7 +371,7 @@ impl ScriptedAgent {
 
     fn wait_for_route(&self, receiver: &str) {
         let route = Route { topic: self.publisher.topic().clone(), receiver: receiver.parse().unwrap() };
-        bus::Barrier::new([route]).await_routes(&self.bus).unwrap().wait(PATIENCE).unwrap();
+        bus::Barrier::new([route]).await_routes(&self.bus).unwrap().wait(TIMEOUT).unwrap();
     }
 }
 
@@ -491,7 +491,7 @@ fn maps_of_a_network_that_a_neighbour_names_as_another_are_left_out() {
         let ego = scope.spawn(|| {
             let bus = router.join("ego-10", "10");
             // A frame that waited for an excluded neighbour would take for ever.
-            let options = ego_node::NodeOptions { deadline: PATIENCE, keeps_running: true, ..Default::default() };
+            let options = ego_node::NodeOptions { deadline: TIMEOUT, keeps_running: true, ..Default::default() };
             let report = ego_node::run(&bus, &cav("10"), ego(Method::MAX), &options, &stop).unwrap();
             assert_eq!((report.frames, report.at_deadline), (4, 0));
             leave(bus)
@@ -499,7 +499,7 @@ fn maps_of_a_network_that_a_neighbour_names_as_another_are_left_out() {
         fleet.iter().for_each(|agent| agent.wait_for_route("ego-10"));
         let describe = |agent: &ScriptedAgent, descriptor: Descriptor| {
             let publisher = agent.bus.publisher(topic("20", Stream::Descriptor), PublisherOptions::POSE).unwrap();
-            publisher.offer(0, descriptor);
+            publisher.submit(0, descriptor);
             // It is transmitted before the next map is.
             publisher.finish();
         };
@@ -546,11 +546,11 @@ fn an_agent_receives_its_own_sensors_only_and_reports_a_missing_pose() {
             |cav_id| replay.publisher(topic(cav_id, Stream::Lidar), PublisherOptions::SENSOR.lossless(8)).unwrap();
         let (own, other) = (lidar("20"), lidar("10"));
         let route = Route { topic: topic("20", Stream::Lidar), receiver: "agent-20".parse().unwrap() };
-        bus::Barrier::new([route]).await_routes(&replay).unwrap().wait(PATIENCE).unwrap();
+        bus::Barrier::new([route]).await_routes(&replay).unwrap().wait(TIMEOUT).unwrap();
         let frame = scenario.load(1, 0, &LoadOptions::default()).unwrap();
         // A sweep without a pose.
-        other.offer(1, protocol::Lidar { points: frame.points.clone() });
-        own.offer(1, protocol::Lidar { points: frame.points });
+        other.submit(1, protocol::Lidar { points: frame.points.clone() });
+        own.submit(1, protocol::Lidar { points: frame.points });
         other.finish();
         own.finish();
         running.join().unwrap()

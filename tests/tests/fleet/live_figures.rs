@@ -7,7 +7,7 @@ use std::process::Command;
 use std::time::Instant;
 
 use serde_json::Value;
-use tests::fleet::{PATIENCE, Up, programs, signal, write_scenario};
+use tests::fleet::{TIMEOUT, Up, programs, signal, write_scenario};
 use tests::locks::exclusive_lock;
 
 fn json(path: &Path) -> Value {
@@ -131,7 +131,7 @@ fn prometheus_gets_latency_answered_ticks_fused_neighbours_and_resources() {
     let value = |text: &str, name: &str| -> Option<f64> {
         text.lines().find(|line| line.starts_with(&format!("{name}{{")))?.rsplit(' ').next()?.parse().ok()
     };
-    let deadline = Instant::now() + PATIENCE;
+    let deadline = Instant::now() + TIMEOUT;
     let text = loop {
         let text = String::from_utf8(bus::web::fetch(address, "/metrics").unwrap().1).unwrap();
         if value(&text, "v2vloc_answered_ticks_total").is_some_and(|answered| answered >= 5.0) {

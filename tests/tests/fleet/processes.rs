@@ -7,7 +7,7 @@ use deploy::scenario::Scenario;
 use protocol::{Stream, Topic};
 use recording::Recording;
 use serde_json::Value;
-use tests::fleet::{PATIENCE, Up, fused, is_running, results, signal, write_scenario};
+use tests::fleet::{TIMEOUT, Up, fused, is_running, results, signal, write_scenario};
 use tests::locks::exclusive_lock;
 
 fn json(path: &std::path::Path) -> Value {
@@ -154,7 +154,7 @@ fn the_death_of_the_launcher_ends_the_fleet() {
     let pids = up.pids();
     signal(up.pid(), "KILL");
     up.wait();
-    let deadline = Instant::now() + PATIENCE;
+    let deadline = Instant::now() + TIMEOUT;
     while pids.values().any(|pid| is_running(*pid)) {
         assert!(Instant::now() < deadline, "orphans: {pids:?}");
         std::thread::sleep(Duration::from_millis(50));

@@ -6,7 +6,7 @@ use std::path::Path;
 use std::process::{Command, Output};
 
 use agent::rate::RateConfig;
-use deploy::run::run_fleet::{RunResult, UpOptions, up};
+use deploy::run::run_fleet::{RunOptions, RunResult, run_scenario};
 use deploy::scenario::Scenario;
 use ego_fuser::pairing::PairingConfig;
 use ego_fuser_offline::evaluation::stepped::{AgentPool, ComputeTimes, SteppedConfig};
@@ -221,8 +221,8 @@ fn assert_same_bytes(one: &RunResult, other: &RunResult) {
 }
 
 fn run_up(folder: &Path, scenario: &Path, runs: &str) -> RunResult {
-    let options = UpOptions { runs: folder.join(runs), programs: programs().to_owned(), prefix: "up" };
-    up(&Scenario::load(scenario).unwrap(), &options).unwrap()
+    let options = RunOptions { runs: folder.join(runs), programs: programs().to_owned(), prefix: "up" };
+    run_scenario(&Scenario::load(scenario).unwrap(), &options).unwrap()
 }
 
 #[test]
@@ -284,8 +284,8 @@ fn compute_times_are_measured_once_and_written_down() {
     let folder = tempfile::tempdir().unwrap();
     let scenario = write_scenario(folder.path(), 3, "", "clock: stepped");
     // On a busy machine the compute times may exceed a frame: then the run is refused with a message.
-    let options = UpOptions { runs: folder.path().join("runs"), programs: programs().to_owned(), prefix: "up" };
-    match up(&Scenario::load(&scenario).unwrap(), &options) {
+    let options = RunOptions { runs: folder.path().join("runs"), programs: programs().to_owned(), prefix: "up" };
+    match run_scenario(&Scenario::load(&scenario).unwrap(), &options) {
         Ok(run) => {
             let resolved = Scenario::load(&run.folder.file("scenario.yaml")).unwrap();
             let compute = resolved.stepped.unwrap().compute.unwrap();

@@ -59,7 +59,7 @@ fn golden_converted_multi_scale_networks_answer_as_the_reference() {
         let (path, _) = convert(&state, &["--model", model, "--max-points", &slots]).unwrap();
         let network = MultiScaleNetwork::load(&path, Device::Cpu).unwrap();
         let (sweeps, _) = pillars(&golden);
-        let batch = PillarBatch::new(&sweeps.iter().collect::<Vec<_>>(), network.network().lattice());
+        let batch = PillarBatch::new(&sweeps.iter().collect::<Vec<_>>(), network.network().pillar_grid());
         let [width, height, _] = network.network().config.pillar_grid().map(|count| count as i64);
         let cell_m = number(&golden.config()["voxel_size"][0]);
         let normalized = coalign::normalized(&tensor(&golden, "in.pairwise"), height, width, cell_m).unwrap();

@@ -4,7 +4,7 @@ use perception::layers::backbone::BevBackbone;
 use perception::layers::head::DetectionHead;
 use perception::layers::shrink::{Compressor, Shrink};
 use perception::model_config::{DetectorConfig, ShrinkConfig};
-use perception::pillars::batch::{PillarBatch, PillarLattice};
+use perception::pillars::batch::{PillarBatch, PillarGrid};
 use perception::pillars::encoder::PillarEncoder;
 use perception::pillars::projection::PillarProjection;
 use perception::pillars::voxels::{Pillars, Voxeliser};
@@ -27,16 +27,16 @@ fn golden_c1_pointpillar() {
     let in_file_order = pillar_features.index_select(0, &Tensor::from_slice(&rows));
     assert_close("pillar_features", &values(&in_file_order), &expected, ATOL, RTOL);
 
-    let canvas = case.batch.scatter(&pillar_features, &case.lattice);
+    let canvas = case.batch.scatter(&pillar_features, &case.pillar_grid);
     let (_, expected) = golden.f32("out.spatial_features_ch0_7");
     assert_close("spatial_features", &values(&canvas.narrow(1, 0, 8)), &expected, ATOL, RTOL);
 
     // The detector's own pillar encoder works without tensors, sweep by sweep.
     let projection = PillarProjection::new(&case.encoder);
-    let size = case.lattice.width * case.lattice.height * projection.channels();
+    let size = case.pillar_grid.width * case.pillar_grid.height * projection.channels();
     let mut canvases = vec![0.0; case.sweeps.len() * size];
     for (pillars, canvas) in case.sweeps.iter().zip(canvases.chunks_exact_mut(size)) {
-        projection.scatter(pillars, &case.lattice, canvas);
+        projection.scatter(pillars, &case.pillar_grid, canvas);
     }
     let projected = Tensor::from_slice(&canvases).reshape(canvas.permute([0, 2, 3, 1]).size()).permute([0, 3, 1, 2]);
     assert_close("projected", &values(&projected.narrow(1, 0, 8)), &expected, ATOL, RTOL);
@@ -52,7 +52,7 @@ fn golden_c1_intermediate_attfuse() {
     let golden = golden("c1_intermediate_attfuse");
     let case = EncoderCase::new(&golden);
     let (_, record_len) = golden.i64("in.record_len");
-    let canvas = case.batch.scatter(&tch::no_grad(|| case.encoder.forward(&case.batch, false)), &case.lattice);
+    let canvas = case.batch.scatter(&tch::no_grad(|| case.encoder.forward(&case.batch, false)), &case.pillar_grid);
     for backbone in [None, Some(case.backbone.folded())] {
         let backbone = backbone.as_ref().unwrap_or(&case.backbone);
         let features = tch::no_grad(|| backbone.forward_fused(&canvas, &record_len, false)).unwrap();
@@ -110,7 +110,7 @@ fn golden_c2_voxelise() {
 
 /// A whole encoder with the weights of a case, and its input.
 struct EncoderCase {
-    lattice: PillarLattice,
+    pillar_grid: PillarGrid,
     sweeps: Vec<Pillars>,
     batch: PillarBatch,
     /// Row of the batch for every pillar in the order of the file.
@@ -131,10 +131,10 @@ impl EncoderCase {
         let anchors = golden.f32("w.cls_head.bias").1.len() as i64;
         let head = DetectionHead::new(&root, config.backbone_channels(), anchors);
         load(&network, golden, "");
-        let lattice = PillarLattice::new(&config);
+        let pillar_grid = PillarGrid::new(&config);
         let (sweeps, row_of_pillar) = pillars(golden);
-        let batch = PillarBatch::new(&sweeps.iter().collect::<Vec<_>>(), &lattice);
-        Self { lattice, sweeps, batch, row_of_pillar, encoder, backbone, head }
+        let batch = PillarBatch::new(&sweeps.iter().collect::<Vec<_>>(), &pillar_grid);
+        Self { pillar_grid, sweeps, batch, row_of_pillar, encoder, backbone, head }
     }
 
     /// Compares the concatenated levels and the heads.

@@ -245,7 +245,7 @@ fn golden_c6_e2e_where2comm_single() {
     let network = PointPillars::new(&variables.root(), &detector).unwrap();
     load(&variables, &golden, "");
     let (sweeps, _) = pillars(&golden);
-    let batch = PillarBatch::new(&sweeps.iter().collect::<Vec<_>>(), network.lattice());
+    let batch = PillarBatch::new(&sweeps.iter().collect::<Vec<_>>(), network.pillar_grid());
     let maps = no_grad(|| network.features(&batch, false));
     let confidence = no_grad(|| network.heads(&maps)).unwrap().confidence();
     let gate = gate(&fusion["communication"], "threshold");
@@ -302,7 +302,7 @@ fn where2comm_detector(golden: &Golden) -> DetectorConfig {
 /// Compares both heads, and returns the share of cells that is sent.
 fn check_heads(golden: &Golden, network: &MultiScaleNetwork, samples: &[Placement]) -> f64 {
     let (sweeps, _) = pillars(golden);
-    let batch = PillarBatch::new(&sweeps.iter().collect::<Vec<_>>(), network.network().lattice());
+    let batch = PillarBatch::new(&sweeps.iter().collect::<Vec<_>>(), network.network().pillar_grid());
     let output = no_grad(|| network.forward(&batch, samples)).unwrap();
     assert_close("psm", &values(&output.heads.scores), &golden.f32("out.psm").1, ATOL, RTOL);
     assert_close("rm", &values(&output.heads.offsets), &golden.f32("out.rm").1, ATOL, RTOL);

@@ -8,8 +8,8 @@ use bus::{self, Barrier, Bus, BusError, BusOptions, Credentials, Event, Inbox, P
 use deploy::operate::keys::{KeyPlan, make};
 use protocol::message::Points;
 use protocol::{Gnss, GnssSource, Lidar, Limits, PointCloud, Pose, PoseEstimate, Stamp, Stream, Topic, wire};
-use tests::bus::{PATIENCE, next_event, wait_for};
-use tests::keys::{GuardedRouter, TRIED_FOR, keys_for, stranger};
+use tests::bus::{TIMEOUT, next_event, wait_for};
+use tests::keys::{GuardedRouter, TRIED_FOR, keys_for, unauthorised_peer};
 use zenoh::qos::CongestionControl;
 use zenoh::{Session, Wait};
 
@@ -42,10 +42,10 @@ fn captured_keys(router: &Session) -> (Arc<Mutex<BTreeSet<String>>>, zenoh::pubs
 /// Sends poses until one has arrived: the route is up.
 fn reaches(sender: &Bus, topic_text: &str, receiver: &Arc<Inbox>) {
     let publisher = sender.publisher(topic(topic_text), PublisherOptions::POSE).unwrap();
-    let deadline = Instant::now() + PATIENCE;
+    let deadline = Instant::now() + TIMEOUT;
     loop {
         assert!(Instant::now() < deadline, "nothing comes on {topic_text}");
-        publisher.offer(7, estimate());
+        publisher.submit(7, estimate());
         if let bus::bounded_queue::Pop::Item(came, Event::Message(arrival)) =
             receiver.take(Some(Instant::now() + Duration::from_millis(100)))
             && came == topic(topic_text)
@@ -82,19 +82,19 @@ fn a_fleet_with_keys_performs_all_its_operations() {
     let (inbox, _subscription) = subscribe(&agent, "1/gnss");
     let publisher = replay.publisher(topic("1/gnss"), PublisherOptions::SENSOR).unwrap();
     let route = Route { topic: topic("1/gnss"), receiver: agent.identity().process.clone() };
-    Barrier::new([route]).await_routes(&replay).unwrap().wait(PATIENCE).unwrap();
+    Barrier::new([route]).await_routes(&replay).unwrap().wait(TIMEOUT).unwrap();
     let measured = Gnss {
         world_from_lidar: Pose::IDENTITY,
         position_std_m: 0.0,
         heading_std_rad: 0.0,
         source: GnssSource::Recorded,
     };
-    publisher.offer(3, measured);
+    publisher.submit(3, measured);
     let (_, Event::Message(_)) = next_event(&inbox) else { panic!("an end before the message") };
     // The flush barrier does not cover passive subscribers: their route may come up later.
     let is_gnss = |taken| matches!(taken, bus::bounded_queue::Pop::Item(found, _) if found == topic("1/gnss"));
     wait_for("the recorder", || {
-        publisher.offer(3, measured);
+        publisher.submit(3, measured);
         is_gnss(tap.take(Some(Instant::now())))
     });
     publisher.finish();
@@ -104,7 +104,7 @@ fn a_fleet_with_keys_performs_all_its_operations() {
     let preview = replay.publisher(topic("1/@preview"), PublisherOptions::PREVIEW).unwrap();
     wait_for("an onlooker", || preview.is_wanted());
     wait_for("a preview", || {
-        preview.offer(3, Lidar::default());
+        preview.submit(3, Lidar::default());
         matches!(viewing.take(Some(Instant::now())), bus::bounded_queue::Pop::Item(..))
     });
     preview.finish();
@@ -117,9 +117,9 @@ fn a_fleet_with_keys_performs_all_its_operations() {
         move |event| seen.lock().unwrap().push(format!("{event:?}"))
     });
     let presence = agent.announce(protocol::Role::Agent).unwrap();
-    wait_for("a liveliness event", || seen.lock().unwrap().iter().any(|text| text.starts_with("Appeared")));
+    wait_for("a liveliness event", || seen.lock().unwrap().iter().any(|text| text.starts_with("Joined")));
     presence.withdraw().unwrap();
-    wait_for("a farewell", || seen.lock().unwrap().iter().any(|text| text.starts_with("Vanished")));
+    wait_for("a farewell", || seen.lock().unwrap().iter().any(|text| text.starts_with("Left")));
 
     // And no process published anything that was refused.
     for principal in ["agent-1", "ego-1", "link-1", "replay", "scorer", "recorder", "viewer"] {
@@ -129,8 +129,8 @@ fn a_fleet_with_keys_performs_all_its_operations() {
     for bus in [agent, ego, link, replay, scorer, recorder, viewer] {
         // Bounded: a query that the router does not answer would take all of it.
         let began = Instant::now();
-        bus.leave(PATIENCE).unwrap();
-        assert!(began.elapsed() < PATIENCE / 2);
+        bus.leave(TIMEOUT).unwrap();
+        assert!(began.elapsed() < TIMEOUT / 2);
     }
 }
 
@@ -173,7 +173,7 @@ fn a_certificate_is_valid_for_its_own_vehicle_only() {
     // Another run is another fleet.
     session.put("v2v/other/1/pose", forged_pose("1")).wait().unwrap();
     // A queryable where no query is allowed, a subscriber to the truth, a liveliness token of another process.
-    let _queryable = session.declare_queryable("v2v/test/nobody").callback(|_| panic!("queried")).wait().unwrap();
+    let _queryable = session.declare_queryable("v2v/test/undeclared").callback(|_| panic!("queried")).wait().unwrap();
     let _truth = session.declare_subscriber("v2v/test/truth").callback(|_| panic!("received")).wait().unwrap();
     let _presence = session.liveliness().declare_token("v2v/test/alive/agent/2").wait().unwrap();
     wait_for("declarations", || router.refused("agent-1", "declare") >= 3);
@@ -211,7 +211,7 @@ fn a_header_under_another_name_is_counted_as_such() {
     let here = protocol::Account::towards(topic("1/pose"), &ego.identity().process);
     let reason = protocol::DropReason::Identity;
     wait_for("a refusal", || {
-        ego.books().ledger().get(&here).is_some_and(|counts| counts.dropped.get(&reason) == Some(&1))
+        ego.stats().ledger().get(&here).is_some_and(|counts| counts.dropped.get(&reason) == Some(&1))
     });
 }
 
@@ -235,18 +235,19 @@ fn unknown_clients_are_refused() {
         // Without the bus's own check of endpoints: the same port, of TCP.
         let text = router.endpoint.as_str().replace("quic/", "tcp/");
         let mut options = BusOptions::client(text.parse().unwrap());
-        options.patience = TRIED_FOR;
+        options.timeout = TRIED_FOR;
         bus::open(&options)
     };
     std::thread::scope(|scope| {
         let other_authority =
-            scope.spawn(|| stranger(&router.endpoint, &keys.join("agent-1"), Some(&theirs.join("agent-1"))));
-        let expired = scope.spawn(|| stranger(&router.endpoint, &keys.join("agent-1"), Some(&keys.join("agent-3"))));
-        let no_certificate = scope.spawn(|| stranger(&router.endpoint, &keys.join("agent-1"), None));
+            scope.spawn(|| unauthorised_peer(&router.endpoint, &keys.join("agent-1"), Some(&theirs.join("agent-1"))));
+        let expired =
+            scope.spawn(|| unauthorised_peer(&router.endpoint, &keys.join("agent-1"), Some(&keys.join("agent-3"))));
+        let no_certificate = scope.spawn(|| unauthorised_peer(&router.endpoint, &keys.join("agent-1"), None));
         let plain = scope.spawn(plain);
         // Nor does a client connect to a router of another authority.
         let our_side =
-            scope.spawn(|| stranger(&router.endpoint, &theirs.join("agent-1"), Some(&theirs.join("agent-1"))));
+            scope.spawn(|| unauthorised_peer(&router.endpoint, &theirs.join("agent-1"), Some(&theirs.join("agent-1"))));
         for (what, tried) in
             [("other", other_authority), ("expired", expired), ("none", no_certificate), ("our side", our_side)]
         {
@@ -275,7 +276,7 @@ fn a_certificate_that_runs_out_ends_its_connection() {
         move |event| watched.lock().unwrap().push(format!("{event:?}"))
     });
     let _presence = agent.announce(protocol::Role::Agent).unwrap();
-    wait_for("the end of a certificate", || watched.lock().unwrap().iter().any(|text| text.starts_with("Vanished")));
+    wait_for("the end of a certificate", || watched.lock().unwrap().iter().any(|text| text.starts_with("Left")));
 }
 
 #[test]
@@ -290,7 +291,7 @@ fn large_messages_come_whole_and_in_order() {
     let _subscriptions = ["1/points", "1/pose"].map(|text| ego.subscribe(topic(text), &inbox).unwrap());
     reaches(&agent, "1/pose", &inbox);
     let publisher = agent.publisher(topic("1/points"), PublisherOptions::FEATURES.lossless(COUNT as usize)).unwrap();
-    (0..COUNT).for_each(|tick| publisher.offer(tick, Points { pose: estimate(), points: cloud(tick) }));
+    (0..COUNT).for_each(|tick| publisher.submit(tick, Points { pose: estimate(), points: cloud(tick) }));
     for tick in 0..COUNT {
         let arrival = loop {
             match next_event(&inbox) {
@@ -325,7 +326,7 @@ fn a_message_over_the_size_limit_is_refused_and_others_are_not_affected() {
     assert_eq!(router.refused("agent-1", "put"), 1, "the pose; the map was never complete");
     let unsound = |text| {
         let here = protocol::Account::towards(topic(text), &ego.identity().process);
-        ego.books()
+        ego.stats()
             .ledger()
             .get(&here)
             .map_or(0, |counts| counts.dropped.get(&protocol::DropReason::Decode).copied().unwrap_or(0))

@@ -13,7 +13,7 @@ use deploy::operate::keys::{KeyPlan, make};
 use serde_json::Value;
 use tests::bus::free_port;
 use tests::fleet::{Up, programs, results, write_scenario, write_sighted_weights};
-use tests::keys::{TRIED_FOR, keys_for, stranger};
+use tests::keys::{TRIED_FOR, keys_for, unauthorised_peer};
 use tests::locks::exclusive_lock;
 use zenoh::qos::CongestionControl;
 use zenoh::{Session, Wait};
@@ -43,7 +43,7 @@ fn boxes(run: &Path) -> Vec<Value> {
 /// Publishes on topics of others, repeatedly; messages that the network does not take at once are dropped.
 fn forge(session: &Session, is_over: &AtomicBool) {
     let _other = session.liveliness().declare_token("v2v/test/alive/agent/4288").wait();
-    let _answers = session.declare_queryable("v2v/test/nobody").callback(|_| ()).wait();
+    let _answers = session.declare_queryable("v2v/test/undeclared").callback(|_| ()).wait();
     while !is_over.load(Ordering::Relaxed) {
         for text in FORGED {
             let put = session.put(format!("v2v/test/{text}"), vec![7_u8; 4096]);
@@ -80,10 +80,10 @@ fn unknown_clients(endpoint: &Endpoint, keys: &Path, expired: &Path, theirs: &Pa
     std::thread::scope(|scope| {
         for (what, own) in ways {
             let authority = &authority;
-            scope.spawn(move || assert!(stranger(endpoint, authority, own).is_err(), "{what}"));
+            scope.spawn(move || assert!(unauthorised_peer(endpoint, authority, own).is_err(), "{what}"));
         }
         let plain = endpoint.as_str().replace("quic/", "tcp/").parse().unwrap();
-        let options = BusOptions { patience: TRIED_FOR, ..BusOptions::client(plain) };
+        let options = BusOptions { timeout: TRIED_FOR, ..BusOptions::client(plain) };
         assert!(bus::open(&options).is_err(), "plain TCP");
     });
 }
@@ -168,10 +168,10 @@ fn unknown_clients_and_an_attacker_change_nothing() {
     assert!(count("declare", "access-control") >= 2, "{refused:?}");
     for cause in ["expired certificate", "certificate of another authority", "no certificate", "plain TCP"] {
         let is_it =
-            |line: &Value| line["peer"] == "stranger" && line["reason"] == "handshake" && line["message"] == cause;
+            |line: &Value| line["peer"] == "unauthorised" && line["reason"] == "handshake" && line["message"] == cause;
         assert!(refused.iter().any(is_it), "{cause}: {refused:?}");
     }
-    let known = ["agent-666", "stranger"];
+    let known = ["agent-666", "unauthorised"];
     assert!(refused.iter().all(|line| known.contains(&line["peer"].as_str().unwrap())), "{refused:?}");
     let modes = fs::read_to_string(up.folder.join("scenario.yaml")).unwrap();
     assert!(modes.contains("security"), "the run reports that it had keys");

@@ -22,7 +22,7 @@ use protocol::{
 };
 use tch::Device;
 use tch::nn::VarStore;
-use tests::bus::{PATIENCE, TestRouter, next_event, wait_for};
+use tests::bus::{TIMEOUT, TestRouter, next_event, wait_for};
 use tests::locks::random_generator_lock;
 use tests::mutation::wire_target::reseal;
 use tests::scene;
@@ -67,7 +67,7 @@ impl Neighbour {
         // It probes its route; its messages are put by the test.
         let publisher = bus.publisher(bev_of(name), PublisherOptions::FEATURES).unwrap();
         let route = Route { topic: bev_of(name), receiver: "ego-10".parse().unwrap() };
-        Barrier::new([route]).await_routes(&bus).unwrap().wait(PATIENCE).unwrap();
+        Barrier::new([route]).await_routes(&bus).unwrap().wait(TIMEOUT).unwrap();
         drop(publisher);
         let agent = Agent::new(cav(name), Box::new(RecordedPose), network());
         Self { bus, agent, place, sequence: 0, sent: Vec::new(), _presence: presence }
@@ -180,7 +180,7 @@ fn with_number(mut bytes: Vec<u8>, old: [f64; 2], new: f64) -> Vec<u8> {
 /// A few kilobytes that decompress to 64 MiB, where 8 KiB are announced.
 fn bomb(stamp: &Stamp, pose: PoseEstimate, grid: BevGrid) -> Vec<u8> {
     let zeros = zstd::bulk::compress(&vec![0; 64 << 20], 1).unwrap();
-    let codec = Codec { dtype: Dtype::F32, selection: Selection::Dense, packing: Compression::Zstd };
+    let codec = Codec { dtype: Dtype::F32, selection: Selection::Dense, compression: Compression::Zstd };
     let features = EncodedFeatures { grid, channels: 1, code_of: None, codec, rate: None, body: Body::Bytes(zeros) };
     wire::encode(stamp, Bev { pose, features }).unwrap().to_vec()
 }
@@ -194,15 +194,15 @@ fn play(scenario: &Scenario, is_hostile: bool) -> (Vec<Vec<Detection>>, Counts, 
     let _subscription = scorer.subscribe(detections, &inbox).unwrap();
     std::thread::scope(|scope| {
         let bus = router.join("ego-10", "10");
-        let books = bus.books().clone();
+        let stats = bus.stats().clone();
         let ego = scope.spawn(|| {
             let bus = bus;
-            let options = NodeOptions { deadline: PATIENCE, keeps_running: true, ..NodeOptions::default() };
+            let options = NodeOptions { deadline: TIMEOUT, keeps_running: true, ..NodeOptions::default() };
             let ego = Ego::new(network(), Method::MAX).unwrap();
             node::run(&bus, &cav("10"), ego, &options, &stop).unwrap();
-            let books = bus.books().clone();
-            bus.leave(PATIENCE).unwrap();
-            books.ledger()
+            let stats = bus.stats().clone();
+            bus.leave(TIMEOUT).unwrap();
+            stats.ledger()
         });
         let mut own = Neighbour::join(&router, "10", 0);
         let mut other = Neighbour::join(&router, "20", 1);
@@ -214,8 +214,8 @@ fn play(scenario: &Scenario, is_hostile: bool) -> (Vec<Vec<Detection>>, Counts, 
                     other.put(bytes);
                     // One at a time: if many wait, the newest replaces the oldest unread.
                     let all: u64 = expected.values().sum();
-                    wait_for(name, || counts(&books.ledger()).dropped_total() == all);
-                    let counts = counts(&books.ledger());
+                    wait_for(name, || counts(&stats.ledger()).dropped_total() == all);
+                    let counts = counts(&stats.ledger());
                     assert_eq!(counts.dropped.get(&reason), expected.get(&reason), "{name}: {counts:?}");
                 }
             }

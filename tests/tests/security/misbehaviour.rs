@@ -52,13 +52,14 @@ fn an_attacker_in_a_live_fleet_is_detected_named_and_without_effect() {
     let agents = dataset::open(&with.path().join("scene")).unwrap().scenarios.remove(0).agents;
     let [ego, honest, attacker] = &agents[..] else { panic!("{agents:?}") };
 
-    let (attacked, metrics, status) = play(with.path(), "", &format!("vehicles: {{'{attacker}': {{lie: noise}}}}"));
+    let (attacked, metrics, status) =
+        play(with.path(), "", &format!("vehicles: {{'{attacker}': {{falsification: noise}}}}"));
     let (expected, ..) = play(without.path(), &format!("agents: ['{ego}', '{honest}']"), "");
 
     // One message of noise may be anything; two that follow each other cannot be of one vehicle.
     let is_out = |report: &DetectionsReport| {
         let left_out = report.result.skipped.iter().find(|skipped| skipped.cav == *attacker);
-        left_out.is_some_and(|skipped| skipped.reason == Some(DropReason::Distrusted))
+        left_out.is_some_and(|skipped| skipped.reason == Some(DropReason::Misbehaviour))
     };
     let out: Vec<_> = attacked.iter().filter(|(_, report)| is_out(report)).collect();
     assert!(out.len() >= FRAMES - 1, "left out of {} frames", out.len());
@@ -69,12 +70,19 @@ fn an_attacker_in_a_live_fleet_is_detected_named_and_without_effect() {
     }
 
     let [trusted, named] = [honest, attacker].map(|cav| &metrics.neighbours[cav]);
-    assert_eq!((trusted.fused, trusted.doubts.len(), trusted.doubt), (FRAMES as u64, 0, None), "{trusted:?}");
-    assert!(named.doubt.is_some() && named.fused <= 1 && named.trust.is_some_and(|trust| trust < 0.3), "{named:?}");
-    assert!(named.left_out[&DropReason::Distrusted] >= FRAMES as u64 - 1);
+    assert_eq!(
+        (trusted.fused, trusted.misbehaviour_counts.len(), trusted.misbehaviour),
+        (FRAMES as u64, 0, None),
+        "{trusted:?}"
+    );
+    assert!(
+        named.misbehaviour.is_some() && named.fused <= 1 && named.trust.is_some_and(|trust| trust < 0.3),
+        "{named:?}"
+    );
+    assert!(named.left_out[&DropReason::Misbehaviour] >= FRAMES as u64 - 1);
     // One machine has one clock.
     assert!(trusted.clock_offset_s.is_some_and(|offset_s| (-60.0..=0.001).contains(&offset_s)), "{trusted:?}");
     let shown = status.neighbours.iter().find(|neighbour| neighbour.cav == *attacker).unwrap();
-    assert_eq!((shown.doubt, shown.trust), (named.doubt, named.trust));
+    assert_eq!((shown.misbehaviour, shown.trust), (named.misbehaviour, named.trust));
     assert!(status.table().contains("left out because"), "{}", status.table());
 }

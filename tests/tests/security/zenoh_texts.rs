@@ -19,7 +19,7 @@ use deploy::operate::keys::KeyPlan;
 use deploy::operate::keys::make;
 use tests::bus::{free_port, wait_for};
 use tests::fleet::{programs, signal};
-use tests::keys::{keys_for, stranger};
+use tests::keys::{keys_for, unauthorised_peer};
 use tests::locks::exclusive_lock;
 use zenoh::Wait;
 
@@ -117,7 +117,7 @@ fn each_failed_handshake_is_counted_once_under_its_cause() {
         // Last: zenoh takes one handshake after the other, and the incomplete one keeps it half a minute.
         (&relay, &ours, Some(ours.as_path())),
     ] {
-        assert!(stranger(endpoint, authority, own).is_err(), "{own:?} is admitted at {endpoint}");
+        assert!(unauthorised_peer(endpoint, authority, own).is_err(), "{own:?} is admitted at {endpoint}");
     }
     let causes = [
         "begun and not finished",
@@ -127,7 +127,7 @@ fn each_failed_handshake_is_counted_once_under_its_cause() {
         "no certificate",
     ];
     wait_for("five causes", || router.counts().len() >= causes.len());
-    let expected = causes.map(|cause| (format!("stranger handshake {cause}"), 1));
+    let expected = causes.map(|cause| (format!("unauthorised handshake {cause}"), 1));
     assert_eq!(router.end(), BTreeMap::from(expected));
 }
 
@@ -146,7 +146,7 @@ fn each_refused_message_is_counted_once_under_its_peer_and_reason() {
     session.put("v2v/test/2/pose", vec![7_u8; 64]).wait().unwrap();
     session.put("v2v/test/1/pose", vec![7_u8; 1 << 20]).wait().unwrap();
     session.delete("v2v/test/2/pose").wait().unwrap();
-    let _queryable = session.declare_queryable("v2v/test/nobody").callback(|_| ()).wait().unwrap();
+    let _queryable = session.declare_queryable("v2v/test/undeclared").callback(|_| ()).wait().unwrap();
     wait_for("four refusals", || router.counts().len() >= 4);
     let expected = ["access-control declare", "access-control delete", "access-control put", "low-pass put"];
     assert_eq!(router.end(), BTreeMap::from(expected.map(|refusal| (format!("agent-1 {refusal}"), 1))));

@@ -52,7 +52,7 @@ fn scene_config(scenes: &Path, encoder: &Path, out: &Path, steps: u64) -> SceneT
         validation: vec![scenes.to_owned()],
         validation_sweeps: 12,
         encoder: encoder.to_owned(),
-        town: "small".into(),
+        scene_name: "small".into(),
         classes: 4,
         centres: 12,
         width: 64,
@@ -144,7 +144,7 @@ fn competitors_learn_on_the_features_of_an_encoder_that_stays_as_it_is() {
         let config = |steps| EndToEndTrainConfig {
             scenes: vec![scenes.clone()],
             regresses,
-            town: "small".into(),
+            scene_name: "small".into(),
             encoder: EncoderStart::Frozen(encoder.clone()),
             run: RunConfig { batch, learning_rate: 3e-3, ..run(&dir.path().join(format!("{regresses:?}")), steps) },
         };

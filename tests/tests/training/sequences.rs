@@ -45,7 +45,7 @@ fn train_head_on(sequences: &Path, encoder: &Path, out: &Path) -> PathBuf {
         validation: vec![sequences.to_owned()],
         validation_sweeps: 10,
         encoder: encoder.to_owned(),
-        town: "sequences".into(),
+        scene_name: "sequences".into(),
         classes: 4,
         centres: 12,
         width: 64,

@@ -46,7 +46,7 @@ pub struct EndToEndConfig {
     /// Target of the regression.
     pub regresses: EndToEndKind,
     /// Name of the scene.
-    pub town: String,
+    pub scene_name: String,
     /// Centre of the training positions, metres in the world.
     pub origin_m: [f64; 3],
     /// The encoder, trained with the regressor.

@@ -104,7 +104,7 @@ impl EndToEndLocalizer {
         })?;
         times.regress = start.elapsed();
         Ok(match upright(&answer, self.config().origin_m) {
-            Some(pose) => Localization::told(PoseEstimate::new(pose.into(), FULL_CONFIDENCE), times),
+            Some(pose) => Localization::from_estimate(PoseEstimate::new(pose.into(), FULL_CONFIDENCE), times),
             None => no_pose(NoPoseReason::Failed, times),
         })
     }
@@ -132,7 +132,7 @@ impl Localize for EndToEndLocalizer {
 }
 
 fn no_pose(reason: NoPoseReason, times: LocalizerTimes) -> Localization {
-    Localization::told(PoseEstimate::NoPose { reason, inlier_count: 0 }, times)
+    Localization::from_estimate(PoseEstimate::NoPose { reason, inlier_count: 0 }, times)
 }
 
 /// Position relative to the origin, cosine and sine of the heading; `None` if that is no pose.
@@ -165,7 +165,7 @@ mod tests {
             residual_widths: vec![8],
             ..SceneEncoderConfig::lean()
         };
-        EndToEndConfig { regresses, town: "test".into(), origin_m: [1000.0, -2000.0, 30.0], encoder }
+        EndToEndConfig { regresses, scene_name: "test".into(), origin_m: [1000.0, -2000.0, 30.0], encoder }
     }
 
     /// Writes a network whose last layer outputs `bias` for any sweep.

@@ -14,7 +14,7 @@ pub(super) const MAX_PARAMETERS: i64 = 256_000_000;
 #[serde(deny_unknown_fields)]
 pub struct SceneHeadConfig {
     /// Name of the scene, in model cards and messages.
-    pub town: String,
+    pub scene_name: String,
     /// SHA-256 of the encoder file whose features it was trained on.
     pub encoder_sha256: String,
     /// Channels of a cell.
@@ -183,7 +183,7 @@ mod tests {
     #[test]
     fn a_head_too_large_for_memory_is_rejected_with_its_size() {
         let head = SceneHeadConfig {
-            town: "test".into(),
+            scene_name: "test".into(),
             encoder_sha256: String::new(),
             cell_channels: 448,
             sweep_channels: 256,

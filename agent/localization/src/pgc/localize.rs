@@ -256,12 +256,12 @@ impl Localization {
 impl Localization {
     /// Result of a method without cells: its estimate is the only evidence.
     #[must_use]
-    pub fn told(estimate: PoseEstimate, times: LocalizerTimes) -> Self {
+    pub fn from_estimate(estimate: PoseEstimate, times: LocalizerTimes) -> Self {
         let (found, inlier_count) = match estimate {
             PoseEstimate::Pose { world_from_cav, confidence } => {
                 let (world_from_sensor, sigma) = (world_from_cav.isometry(), f64::from(confidence));
                 let evidence = PoseEvidence::none();
-                (Some(FoundPose { world_from_sensor, evidence, sigma, is_withheld: false }), 0)
+                (Some(FoundPose { world_from_sensor, evidence, sigma, is_rejected: false }), 0)
             }
             PoseEstimate::NoPose { inlier_count, .. } => (None, inlier_count),
         };

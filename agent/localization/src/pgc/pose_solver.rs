@@ -48,7 +48,7 @@ pub struct FoundPose {
     /// Confidence, 0..=1.
     pub sigma: f64,
     /// True if the confidence is below the threshold: the pose is not published.
-    pub is_withheld: bool,
+    pub is_rejected: bool,
 }
 
 /// The pose of one sweep, rejected or not, or the reason why there is none.
@@ -105,7 +105,7 @@ impl PoseSolver {
         let last = second.map_or(registration, |second| &second.registration);
         let mut world_from_sensor = last.target_from_source;
         world_from_sensor.translation.vector += Vector3::from(coordinates.origin_m);
-        FoundPose { world_from_sensor, evidence, sigma, is_withheld: self.confidence.withholds(sigma) }
+        FoundPose { world_from_sensor, evidence, sigma, is_rejected: self.confidence.rejects(sigma) }
     }
 }
 
@@ -117,7 +117,7 @@ pub fn estimate(solved: &Solved) -> PoseEstimate {
         inlier_count: u32::try_from(inliers).unwrap_or(u32::MAX),
     };
     match solved {
-        Ok(found) if found.is_withheld => none(NoPoseReason::LowConfidence, found.evidence.inliers),
+        Ok(found) if found.is_rejected => none(NoPoseReason::LowConfidence, found.evidence.inliers),
         Ok(found) => PoseEstimate::new(found.world_from_sensor.into(), found.sigma as f32),
         Err(error @ NoRegistration::TooFewCorrespondences { .. }) => {
             none(NoPoseReason::TooFewPoints, error.inlier_count())
@@ -192,7 +192,7 @@ mod tests {
 
     #[test]
     fn a_pose_with_little_evidence_is_rejected_with_its_inliers() {
-        let strict = ConfidenceModel { withhold_below: 0.99, ..ConfidenceModel::example() };
+        let strict = ConfidenceModel { reject_below: 0.99, ..ConfidenceModel::example() };
         let solver = PoseSolver { confidence: Confidence::Calibrated(strict), ..PoseSolver::default() };
         let scene = SyntheticScene { outliers: 0.8, noise_m: 0.6, ..SyntheticScene::default() };
         let solved = solver.solve(&scene.coordinates(1));

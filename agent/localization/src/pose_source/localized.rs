@@ -25,7 +25,7 @@ pub struct PgcConfig {
     /// Motion limits of the vehicle.
     #[arg(skip)]
     #[serde(default)]
-    pub sanity: MotionGateConfig,
+    pub motion_gate: MotionGateConfig,
 }
 
 /// A network that was trained end to end, a competitor of PGC.
@@ -38,14 +38,14 @@ pub struct EndToEndPoseConfig {
     /// Motion limits of the vehicle.
     #[arg(skip)]
     #[serde(default)]
-    pub sanity: MotionGateConfig,
+    pub motion_gate: MotionGateConfig,
 }
 
 /// Localizes every sweep and checks the pose against earlier ones.
 #[derive(Debug)]
 pub struct LocalizedPose {
     localizer: Box<dyn Localize>,
-    sanity: MotionGate,
+    motion_gate: MotionGate,
     times: Vec<StageTiming>,
 }
 
@@ -56,7 +56,7 @@ impl LocalizedPose {
     /// [`LocalizerError`] names the file and what is wrong with it.
     pub fn pgc(config: &PgcConfig) -> Result<Self, LocalizerError> {
         let localizer = Localizer::load(&config.encoder, &config.head, Device::Cpu)?;
-        Ok(Self::new(Box::new(localizer), config.sanity.clone()))
+        Ok(Self::new(Box::new(localizer), config.motion_gate.clone()))
     }
 
     /// Reads a network that was trained end to end, to compute with on the CPU.
@@ -65,13 +65,13 @@ impl LocalizedPose {
     /// [`LocalizerError`] names the file and what is wrong with it.
     pub fn end_to_end(config: &EndToEndPoseConfig) -> Result<Self, LocalizerError> {
         let localizer = EndToEndLocalizer::load(&config.weights, Device::Cpu)?;
-        Ok(Self::new(Box::new(localizer), config.sanity.clone()))
+        Ok(Self::new(Box::new(localizer), config.motion_gate.clone()))
     }
 
     /// The same with another localizer.
     #[must_use]
-    pub fn new(localizer: Box<dyn Localize>, sanity: MotionGateConfig) -> Self {
-        Self { localizer, sanity: MotionGate::new(sanity), times: Vec::new() }
+    pub fn new(localizer: Box<dyn Localize>, motion_gate: MotionGateConfig) -> Self {
+        Self { localizer, motion_gate: MotionGate::new(motion_gate), times: Vec::new() }
     }
 }
 
@@ -91,8 +91,8 @@ impl PoseSource for LocalizedPose {
         };
         match estimate {
             PoseEstimate::Pose { world_from_cav, confidence } => {
-                let verdict = self.sanity.judge(input.capture_nanos, &world_from_cav.isometry());
-                PoseEstimate::new(world_from_cav, confidence * self.sanity.factor(verdict) as f32)
+                let verdict = self.motion_gate.judge(input.capture_nanos, &world_from_cav.isometry());
+                PoseEstimate::new(world_from_cav, confidence * self.motion_gate.factor(verdict) as f32)
             }
             none @ PoseEstimate::NoPose { .. } => none,
         }
@@ -103,7 +103,7 @@ impl PoseSource for LocalizedPose {
     }
 
     fn jumps(&self) -> u64 {
-        self.sanity.jumps()
+        self.motion_gate.jumps()
     }
 }
 

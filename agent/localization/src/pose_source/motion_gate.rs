@@ -190,14 +190,14 @@ mod tests {
     }
 
     /// Verdicts on poses a tenth of a second apart.
-    fn verdicts(sanity: &mut MotionGate, poses: &[Isometry3<f64>]) -> Vec<Verdict> {
+    fn verdicts(motion_gate: &mut MotionGate, poses: &[Isometry3<f64>]) -> Vec<Verdict> {
         let capture = |step: usize| step as u64 * TENTH_NANOS;
-        poses.iter().enumerate().map(|(step, pose)| sanity.judge(capture(step), pose)).collect()
+        poses.iter().enumerate().map(|(step, pose)| motion_gate.judge(capture(step), pose)).collect()
     }
 
     #[test]
     fn a_drive_through_a_bend_is_no_jump() {
-        let mut sanity = MotionGate::new(MotionGateConfig::default());
+        let mut motion_gate = MotionGate::new(MotionGateConfig::default());
         // 15 m/s, 30 degrees a second, with errors of half a metre.
         let drive: Vec<_> = (0..80)
             .map(|step| {
@@ -207,57 +207,57 @@ mod tests {
                 at(radius * angle.sin() + shake, radius * (1.0 - angle.cos()), angle.to_degrees())
             })
             .collect();
-        assert!(verdicts(&mut sanity, &drive).iter().all(|&verdict| verdict == Verdict::Reachable));
-        assert_eq!(sanity.jumps(), 0);
+        assert!(verdicts(&mut motion_gate, &drive).iter().all(|&verdict| verdict == Verdict::Reachable));
+        assert_eq!(motion_gate.jumps(), 0);
     }
 
     #[test]
     fn a_jump_is_counted_and_not_stored() {
-        let mut sanity = MotionGate::new(MotionGateConfig::default());
+        let mut motion_gate = MotionGate::new(MotionGateConfig::default());
         let mut drive: Vec<_> = (0..12).map(|step| at(f64::from(step), 0.0, 0.0)).collect();
         drive[6] = at(6.0, 40.0, 0.0);
         drive[9] = at(9.0, 0.0, 180.0);
-        let verdicts = verdicts(&mut sanity, &drive);
+        let verdicts = verdicts(&mut motion_gate, &drive);
         for (step, verdict) in verdicts.into_iter().enumerate() {
             let expected = if step == 6 || step == 9 { Verdict::Jump } else { Verdict::Reachable };
             assert_eq!(verdict, expected, "step {step}");
         }
-        assert_eq!(sanity.jumps(), 2);
-        assert!(sanity.factor(Verdict::Jump) < 0.5 && sanity.factor(Verdict::Reachable) == 1.0);
+        assert_eq!(motion_gate.jumps(), 2);
+        assert!(motion_gate.factor(Verdict::Jump) < 0.5 && motion_gate.factor(Verdict::Reachable) == 1.0);
     }
 
     #[test]
     fn poses_that_agree_on_a_new_place_are_accepted() {
-        let mut sanity = MotionGate::new(MotionGateConfig::default());
+        let mut motion_gate = MotionGate::new(MotionGateConfig::default());
         let mut drive = vec![at(500.0, 0.0, 0.0)];
         drive.extend((0..5).map(|step| at(f64::from(step), 0.0, 0.0)));
         use Verdict::{Jump, NewPlace, Reachable};
-        assert_eq!(verdicts(&mut sanity, &drive), [Reachable, Jump, Jump, NewPlace, Reachable, Reachable]);
+        assert_eq!(verdicts(&mut motion_gate, &drive), [Reachable, Jump, Jump, NewPlace, Reachable, Reachable]);
     }
 
     #[test]
     fn jumps_that_do_not_agree_are_never_accepted() {
-        let mut sanity = MotionGate::new(MotionGateConfig::default());
+        let mut motion_gate = MotionGate::new(MotionGateConfig::default());
         let anywhere = (0..20).map(|step| at(f64::from((step * 7919) % 400), 100.0 + f64::from(step * 60), 0.0));
         let drive: Vec<_> = std::iter::once(at(0.0, 0.0, 0.0)).chain(anywhere).collect();
-        assert!(verdicts(&mut sanity, &drive)[1..].iter().all(|&verdict| verdict == Verdict::Jump));
-        assert_eq!(sanity.judge(21 * TENTH_NANOS, &at(20.0, 0.0, 0.0)), Verdict::Reachable);
+        assert!(verdicts(&mut motion_gate, &drive)[1..].iter().all(|&verdict| verdict == Verdict::Jump));
+        assert_eq!(motion_gate.judge(21 * TENTH_NANOS, &at(20.0, 0.0, 0.0)), Verdict::Reachable);
     }
 
     #[test]
     fn a_step_is_checked_against_the_speed_before_it() {
         let standing: Vec<_> = (0..10).map(|_| at(0.0, 0.0, 0.0)).collect();
-        let mut sanity = MotionGate::new(MotionGateConfig::default());
-        verdicts(&mut sanity, &standing);
+        let mut motion_gate = MotionGate::new(MotionGateConfig::default());
+        verdicts(&mut motion_gate, &standing);
         // A car at 50 m/s could be there, one that stood a moment ago cannot.
-        assert_eq!(sanity.judge(10 * TENTH_NANOS, &at(5.0, 0.0, 0.0)), Verdict::Jump);
+        assert_eq!(motion_gate.judge(10 * TENTH_NANOS, &at(5.0, 0.0, 0.0)), Verdict::Jump);
     }
 
     #[test]
     fn a_restarted_scene_or_a_long_gap_resets_the_gate() {
-        let mut sanity = MotionGate::new(MotionGateConfig::default());
-        assert_eq!(sanity.judge(90_000_000_000, &at(0.0, 0.0, 0.0)), Verdict::Reachable);
-        assert_eq!(sanity.judge(0, &at(900.0, 0.0, 0.0)), Verdict::Reachable);
-        assert_eq!(sanity.judge(60_000_000_000, &at(0.0, 0.0, 90.0)), Verdict::Reachable);
+        let mut motion_gate = MotionGate::new(MotionGateConfig::default());
+        assert_eq!(motion_gate.judge(90_000_000_000, &at(0.0, 0.0, 0.0)), Verdict::Reachable);
+        assert_eq!(motion_gate.judge(0, &at(900.0, 0.0, 0.0)), Verdict::Reachable);
+        assert_eq!(motion_gate.judge(60_000_000_000, &at(0.0, 0.0, 90.0)), Verdict::Reachable);
     }
 }

@@ -25,7 +25,7 @@ use support::output;
 use support::progress;
 use tch::Device;
 
-use super::scene_heads::{TownHead, by_head};
+use super::scene_heads::{SceneHeadFile, by_head};
 use support::cli::{BadInput, Outcome};
 
 /// Localize recorded sweeps and compare with their true poses.
@@ -37,16 +37,16 @@ pub(crate) struct Args {
     /// Weights of the encoder [default: pgc-encoder.safetensors beside each head].
     #[arg(long, value_name = "FILE")]
     encoder: Option<PathBuf>,
-    /// Weights of the heads: FILE for all scenes, or TOWN=FILE and TOWN:SEED=FILE for generated ones [SEED: 0]. The
+    /// Weights of the heads: FILE for all scenes, or MAP=FILE and MAP:SEED=FILE for generated ones [SEED: 0]. The
     /// report is over all scenes together.
     #[arg(
         long,
         visible_alias = "weights",
-        value_name = "[TOWN=]FILE",
+        value_name = "[MAP=]FILE",
         num_args = 1..,
         default_value = "deploy/weights/pgc-town1.safetensors"
     )]
-    head: Vec<TownHead>,
+    head: Vec<SceneHeadFile>,
     /// Weights of a network that `agent train end-to-end` wrote, instead of encoder and head.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["encoder", "head", "fit_confidence"])]
     end_to_end: Option<PathBuf>,
@@ -246,9 +246,9 @@ impl Args {
 }
 
 fn report_line(report: &FitReport) -> String {
-    let FitReport { sweeps, bad, bad_withheld, good_withheld } = report;
+    let FitReport { sweeps, bad, bad_rejected, good_rejected } = report;
     let good = sweeps - bad;
-    format!("fitted to {sweeps} poses: rejects {bad_withheld} of {bad} bad ones, {good_withheld} of {good} good ones")
+    format!("fitted to {sweeps} poses: rejects {bad_rejected} of {bad} bad ones, {good_rejected} of {good} good ones")
 }
 
 /// Report as text.
@@ -256,7 +256,7 @@ fn table(summary: &LocalizationSummary) -> String {
     let number = |value: Option<f64>, digits: usize| value.map_or("-".into(), |value| format!("{value:.digits$}"));
     let percent = |share: f64| format!("{:.1} %", 100.0 * share);
     let share = |value: Option<f64>| value.map_or("-".into(), percent);
-    let LocalizationSummary { sweeps, no_pose, withheld, ms, .. } = summary;
+    let LocalizationSummary { sweeps, no_pose, rejected, ms, .. } = summary;
     let total = ms.get("total").copied();
     let stages: Vec<String> =
         ms.iter().filter(|(stage, _)| *stage != "total").map(|(s, ms)| format!("{s} {ms:.1}")).collect();
@@ -285,10 +285,10 @@ fn table(summary: &LocalizationSummary) -> String {
         ),
         format!(
             "rejected   {} poses: {} of {} errors above 3 m, {} of the others",
-            withheld.poses,
-            share(withheld.bad_share),
-            withheld.bad,
-            share(withheld.good_share)
+            rejected.poses,
+            share(rejected.bad_share),
+            rejected.bad,
+            share(rejected.good_share)
         ),
         format!("time       {} ms median: {}", number(total, 1), stages.join(", ")),
     ];

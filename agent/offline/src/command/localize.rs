@@ -10,7 +10,7 @@ use protocol::PoseEstimate;
 use support::output;
 use support::progress;
 
-use super::scene_heads::{TownHead, head_of};
+use super::scene_heads::{SceneHeadFile, head_of};
 use support::cli::{BadInput, Outcome};
 
 /// Localize every sweep of scenes once and write poses and confidences to a table, for training and evaluation.
@@ -24,9 +24,9 @@ pub(crate) struct Args {
     /// Weights of the encoder.
     #[arg(long, value_name = "FILE")]
     encoder: PathBuf,
-    /// Weights of the heads: FILE for all scenes, or TOWN=FILE and TOWN:SEED=FILE for generated ones [SEED: 0].
-    #[arg(long, value_name = "[TOWN=]FILE", num_args = 1.., required = true)]
-    head: Vec<TownHead>,
+    /// Weights of the heads: FILE for all scenes, or MAP=FILE and MAP:SEED=FILE for generated ones [SEED: 0].
+    #[arg(long, value_name = "[MAP=]FILE", num_args = 1.., required = true)]
+    head: Vec<SceneHeadFile>,
     /// The table.
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
@@ -75,8 +75,8 @@ impl Args {
         left_out: &mut LeftOut,
         bar: &ProgressBar,
     ) -> anyhow::Result<usize> {
-        let sanity = MotionGateConfig::default();
-        let config = PgcConfig { encoder: self.encoder.clone(), head: head.to_owned(), sanity };
+        let motion_gate = MotionGateConfig::default();
+        let config = PgcConfig { encoder: self.encoder.clone(), head: head.to_owned(), motion_gate };
         let mut rows: Vec<PoseRow<'_>> = Vec::new();
         for (agent, cav) in scenario.agents.iter().enumerate() {
             let mut source = LocalizedPose::pgc(&config).map_err(bad)?;

@@ -11,49 +11,49 @@ use support::cli::BadInput;
 
 /// A generated scene: the name of its road map and the seed of its objects.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
-struct Town {
+struct MapKey {
     #[serde(rename = "town")]
     name: String,
-    town_seed: u64,
+    map_seed: u64,
 }
 
-/// Weights and their scene: `FILE` for all scenes, `TOWN=FILE` and `TOWN:SEED=FILE` for generated ones.
+/// Weights and their scene: `FILE` for all scenes, `MAP=FILE` and `MAP:SEED=FILE` for generated ones.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct TownHead {
-    town: Option<Town>,
+pub(crate) struct SceneHeadFile {
+    map: Option<MapKey>,
     weights: PathBuf,
 }
 
-impl FromStr for TownHead {
+impl FromStr for SceneHeadFile {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        let Some((town, weights)) = text.split_once('=') else {
-            return Ok(Self { town: None, weights: text.into() });
+        let Some((map, weights)) = text.split_once('=') else {
+            return Ok(Self { map: None, weights: text.into() });
         };
-        let (name, seed) = town.split_once(':').unwrap_or((town, "0"));
-        let town_seed = seed.parse().map_err(|_| format!("{seed:?} is no seed of a town"))?;
-        Ok(Self { town: Some(Town { name: name.to_owned(), town_seed }), weights: weights.into() })
+        let (name, seed) = map.split_once(':').unwrap_or((map, "0"));
+        let map_seed = seed.parse().map_err(|_| format!("{seed:?} is no seed of a map"))?;
+        Ok(Self { map: Some(MapKey { name: name.to_owned(), map_seed }), weights: weights.into() })
     }
 }
 
 /// The weights of the head for a scenario.
 ///
 /// # Errors
-/// [`BadInput`] when its town cannot be read or has no head, and when one of several heads has no town.
-pub(crate) fn head_of<'a>(heads: &'a [TownHead], scenario: &Scenario) -> Result<&'a Path, BadInput> {
-    if let [TownHead { town: None, weights }] = heads {
+/// [`BadInput`] when its map cannot be read or has no head, and when one of several heads has no map.
+pub(crate) fn head_of<'a>(heads: &'a [SceneHeadFile], scenario: &Scenario) -> Result<&'a Path, BadInput> {
+    if let [SceneHeadFile { map: None, weights }] = heads {
         return Ok(weights);
     }
-    if let Some(TownHead { weights, .. }) = heads.iter().find(|head| head.town.is_none()) {
+    if let Some(SceneHeadFile { weights, .. }) = heads.iter().find(|head| head.map.is_none()) {
         let (weights, count) = (weights.display(), heads.len());
-        return Err(BadInput::new(format!("--head {weights}: of {count} heads each needs its town, TOWN={weights}")));
+        return Err(BadInput::new(format!("--head {weights}: of {count} heads each needs its map, MAP={weights}")));
     }
-    let town =
-        town_of(scenario).with_context(|| format!("the town of scenario {}", scenario.name)).map_err(BadInput::of)?;
-    let head = heads.iter().find(|head| head.town.as_ref() == Some(&town));
-    let Town { name, town_seed } = &town;
-    let missing = || BadInput::new(format!("{}: no --head for town {name}:{town_seed}", scenario.name));
+    let map =
+        map_of(scenario).with_context(|| format!("the map of scenario {}", scenario.name)).map_err(BadInput::of)?;
+    let head = heads.iter().find(|head| head.map.as_ref() == Some(&map));
+    let MapKey { name, map_seed } = &map;
+    let missing = || BadInput::new(format!("{}: no --head for map {name}:{map_seed}", scenario.name));
     Ok(&head.ok_or_else(missing)?.weights)
 }
 
@@ -62,10 +62,10 @@ pub(crate) fn head_of<'a>(heads: &'a [TownHead], scenario: &Scenario) -> Result<
 /// # Errors
 /// [`BadInput`] as [`head_of`], and when a folder has no scenario, or scenarios of several towns.
 pub(crate) fn by_head<'a>(
-    heads: &'a [TownHead],
+    heads: &'a [SceneHeadFile],
     scenes: &[PathBuf],
 ) -> Result<Vec<(&'a Path, Vec<PathBuf>)>, BadInput> {
-    if let [TownHead { town: None, weights }] = heads {
+    if let [SceneHeadFile { map: None, weights }] = heads {
         return Ok(vec![(weights, scenes.to_vec())]);
     }
     let mut groups: Vec<(&Path, Vec<PathBuf>)> = Vec::new();
@@ -85,14 +85,14 @@ pub(crate) fn by_head<'a>(
     Ok(groups)
 }
 
-/// The part of `data_protocol.yaml` that names the town.
+/// The part of `data_protocol.yaml` that names the map.
 #[derive(Debug, Deserialize)]
 struct ProtocolFile {
-    generator: Town,
+    generator: MapKey,
 }
 
-/// Reads the generated town of a scenario.
-fn town_of(scenario: &Scenario) -> anyhow::Result<Town> {
+/// Reads the generated map of a scenario.
+fn map_of(scenario: &Scenario) -> anyhow::Result<MapKey> {
     let points = scenario.points_path(0, 0, None)?;
     let folder = points.ancestors().nth(2).context("it lies in no folder")?;
     let path = folder.join("data_protocol.yaml");
@@ -109,19 +109,19 @@ mod tests {
 
     #[test]
     fn heads_are_of_one_town_or_of_all() {
-        let town = |name: &str, town_seed| Some(Town { name: name.into(), town_seed });
-        for (text, expected) in [("h.st", None), ("town1=h.st", town("town1", 0)), ("town4:3=h.st", town("town4", 3))] {
-            let head: TownHead = text.parse().unwrap();
-            assert_eq!((head.town, head.weights), (expected, PathBuf::from("h.st")), "{text}");
+        let map = |name: &str, map_seed| Some(MapKey { name: name.into(), map_seed });
+        for (text, expected) in [("h.st", None), ("town1=h.st", map("town1", 0)), ("town4:3=h.st", map("town4", 3))] {
+            let head: SceneHeadFile = text.parse().unwrap();
+            assert_eq!((head.map, head.weights), (expected, PathBuf::from("h.st")), "{text}");
         }
-        assert!("town1:x=h".parse::<TownHead>().unwrap_err().contains('x'));
+        assert!("town1:x=h".parse::<SceneHeadFile>().unwrap_err().contains('x'));
     }
 
     #[test]
     fn the_town_of_a_generated_scene_is_read_from_its_protocol() {
-        let text = "description: x\ngenerator:\n  name: synth\n  town: 'town4'\n  town_seed: 5\nworld:\n  seed: 1\n";
+        let text = "description: x\ngenerator:\n  name: synth\n  town: 'town4'\n  map_seed: 5\nworld:\n  seed: 1\n";
         let file: ProtocolFile = serde_saphyr::from_str(text).unwrap();
-        assert_eq!(file.generator, Town { name: "town4".into(), town_seed: 5 });
+        assert_eq!(file.generator, MapKey { name: "town4".into(), map_seed: 5 });
     }
 
     #[test]
@@ -136,14 +136,14 @@ mod tests {
         let [a, b, c] = [(Subset::Town1loc, "a"), (Subset::Town4loc, "b"), (Subset::Town1loc, "c")]
             .map(|(subset, name)| scene(subset, name));
         let scenes = [a.clone(), b.clone(), c.clone()];
-        let heads: Vec<TownHead> = ["town1=1.st", "town4=4.st"].map(|head| head.parse().unwrap()).into();
+        let heads: Vec<SceneHeadFile> = ["town1=1.st", "town4=4.st"].map(|head| head.parse().unwrap()).into();
         let groups = by_head(&heads, &scenes).unwrap();
         assert_eq!(groups, [(Path::new("1.st"), vec![a, c]), (Path::new("4.st"), vec![b])]);
         let error = by_head(&heads[..1], &scenes).unwrap_err().to_string();
-        assert!(error.contains("no --head for town town4:0"), "{error}");
+        assert!(error.contains("no --head for map town4:0"), "{error}");
         let unclear = ["town1=1.st", "h.st"].map(|head| head.parse().unwrap());
         let error = by_head(&unclear, &scenes).unwrap_err().to_string();
-        assert!(error.contains("h.st: of 2 heads each needs its town"), "{error}");
+        assert!(error.contains("h.st: of 2 heads each needs its map"), "{error}");
         let any = ["h.st".parse().unwrap()];
         assert_eq!(by_head(&any, &scenes).unwrap(), [(Path::new("h.st"), scenes.to_vec())]);
     }

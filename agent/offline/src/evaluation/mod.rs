@@ -10,7 +10,7 @@ use dataset::frame::Frame;
 use dataset::{self, LeftOut, LoadOptions, Problem, ReadError, Scenario};
 use protocol::{CavId, Pose, PoseEstimate};
 
-pub use summary::{CalibrationBin, LocalizationSummary, WithheldSummary, reliability_charts};
+pub use summary::{CalibrationBin, LocalizationSummary, RejectionSummary, reliability_charts};
 pub use table::{write_csv, write_error_table};
 
 use localization::pgc::LocalizerError;
@@ -95,7 +95,7 @@ impl EvaluatedSweep {
     pub fn judge_again(&mut self, confidence: &Confidence) {
         let Some(found) = &mut self.localization.found else { return };
         found.sigma = confidence.sigma(&found.evidence);
-        found.is_withheld = confidence.withholds(found.sigma);
+        found.is_rejected = confidence.rejects(found.sigma);
         self.localization.estimate = localization::pgc::pose_solver::estimate(&Ok(*found));
     }
 }
@@ -144,7 +144,10 @@ pub fn evaluate_source(
         let start = Instant::now();
         let input = PoseInput { cav, capture_nanos: *capture_nanos, cloud: points, measured: measured.as_ref() };
         let estimate = source.estimate(&input);
-        Ok(Localization::told(estimate, LocalizerTimes { solve: start.elapsed(), ..LocalizerTimes::default() }))
+        Ok(Localization::from_estimate(
+            estimate,
+            LocalizerTimes { solve: start.elapsed(), ..LocalizerTimes::default() },
+        ))
     };
     evaluate_with(&mut ask, options, on_sweep)
 }
@@ -244,7 +247,7 @@ pub(super) mod tests {
         let found = sweep.error().unwrap();
         assert_eq!(sweep.told_error(), Some(found));
         let strict = localization::pgc::confidence::ConfidenceModel {
-            withhold_below: 1.0,
+            reject_below: 1.0,
             ..localization::pgc::confidence::ConfidenceModel::example()
         };
         sweep.judge_again(&Confidence::Calibrated(strict));

@@ -53,7 +53,7 @@ pub struct LocalizationSummary {
     /// Those groups, by ascending sigma.
     pub calibration: Vec<CalibrationBin>,
     /// Rejected poses, and the good ones among them.
-    pub withheld: WithheldSummary,
+    pub rejected: RejectionSummary,
     /// Median milliseconds by stage; `total` is that of all stages of a sweep.
     pub ms: BTreeMap<String, f64>,
 }
@@ -75,7 +75,7 @@ pub struct CalibrationBin {
 
 /// Results of the rejection threshold.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub struct WithheldSummary {
+pub struct RejectionSummary {
     /// Number of estimated poses that are rejected.
     pub poses: usize,
     /// Number of estimated poses with an error above 3 m.
@@ -91,7 +91,7 @@ pub struct WithheldSummary {
 struct Judged {
     sigma: f64,
     error_m: f64,
-    is_withheld: bool,
+    is_rejected: bool,
 }
 
 impl LocalizationSummary {
@@ -134,7 +134,7 @@ impl LocalizationSummary {
             inlier_ratio_spearman: spearman(&ratios, &errors),
             calibration_error: mean(&gaps),
             calibration,
-            withheld: withheld(&judged),
+            rejected: rejected(&judged),
             ms: median_times(sweeps),
         }
     }
@@ -143,7 +143,7 @@ impl LocalizationSummary {
 fn judged(sweeps: &[EvaluatedSweep]) -> Vec<Judged> {
     let judged = |sweep: &EvaluatedSweep| {
         let (found, error) = (sweep.localization.found?, sweep.error()?);
-        Some(Judged { sigma: found.sigma, error_m: error.distance_m, is_withheld: found.is_withheld })
+        Some(Judged { sigma: found.sigma, error_m: error.distance_m, is_rejected: found.is_rejected })
     };
     sweeps.iter().filter_map(judged).collect()
 }
@@ -165,11 +165,11 @@ fn calibration(judged: &[Judged]) -> Vec<CalibrationBin> {
     (0..BINS).map(|place| &by_sigma[cut(place)..cut(place + 1)]).filter(|poses| !poses.is_empty()).map(bin).collect()
 }
 
-fn withheld(judged: &[Judged]) -> WithheldSummary {
+fn rejected(judged: &[Judged]) -> RejectionSummary {
     let (good, bad): (Vec<&Judged>, Vec<&Judged>) = judged.iter().partition(|pose| pose.error_m <= BAD_M);
-    let count = |poses: &[&Judged]| poses.iter().filter(|pose| pose.is_withheld).count();
+    let count = |poses: &[&Judged]| poses.iter().filter(|pose| pose.is_rejected).count();
     let share = |poses: &[&Judged]| (!poses.is_empty()).then(|| count(poses) as f64 / poses.len() as f64);
-    WithheldSummary {
+    RejectionSummary {
         poses: count(&good) + count(&bad),
         bad: bad.len(),
         bad_share: share(&bad),
@@ -197,9 +197,9 @@ pub fn reliability_charts(sweeps: &[EvaluatedSweep]) -> Vec<Chart> {
     let bins = calibration(&judged);
     let published =
         sweeps.iter().filter(|sweep| matches!(sweep.localization.estimate, PoseEstimate::Pose { .. })).count();
-    let cloud = |name: &str, is_withheld: bool| Series {
+    let cloud = |name: &str, is_rejected: bool| Series {
         name: name.into(),
-        points: (judged.iter().filter(|pose| pose.is_withheld == is_withheld))
+        points: (judged.iter().filter(|pose| pose.is_rejected == is_rejected))
             .map(|pose| (pose.sigma, pose.error_m.clamp(0.01, 1000.0)))
             .collect(),
         mark: Mark::Dots,
@@ -246,14 +246,14 @@ mod tests {
         assert!(summary.p50_m < summary.p95_m && summary.p95_m <= summary.max_m);
         assert_eq!(summary.calibration.iter().map(|bin| bin.poses).sum::<usize>(), 40 - summary.no_pose);
         assert!(summary.sigma_spearman.unwrap() < -0.5);
-        assert_eq!((summary.withheld.poses, summary.withheld.good_share), (0, Some(0.0)));
+        assert_eq!((summary.rejected.poses, summary.rejected.good_share), (0, Some(0.0)));
         assert_eq!(summary.ms.len(), 6);
         // Rejecting everything leaves every sweep without a pose, and the errors of unpublished poses do not count.
-        let all = Confidence::Calibrated(ConfidenceModel { withhold_below: 1.1, ..ConfidenceModel::example() });
+        let all = Confidence::Calibrated(ConfidenceModel { reject_below: 1.1, ..ConfidenceModel::example() });
         sweeps.iter_mut().for_each(|sweep| sweep.judge_again(&all));
         let silent = LocalizationSummary::of(&sweeps);
         assert_eq!((silent.no_pose, silent.success_3m, silent.mean_m), (40, 0.0, None));
-        assert_eq!(silent.withheld.bad_share, Some(1.0));
+        assert_eq!(silent.rejected.bad_share, Some(1.0));
         assert!(silent.sigma_spearman.is_some());
     }
 

@@ -132,8 +132,8 @@ mod tests {
         let table = ErrorTable::read(&path).unwrap();
         for (step, sweep) in sweeps.iter().enumerate() {
             match (table.row(0, step as u64), sweep.told_error()) {
-                (TableRow::Pose { error, .. }, Some(told)) => {
-                    assert!((error.distance_m() - told.distance_m).abs() < 1e-3);
+                (TableRow::Pose { error, .. }, Some(estimated)) => {
+                    assert!((error.distance_m() - estimated.distance_m).abs() < 1e-3);
                 }
                 (TableRow::NoPose, None) => {}
                 other => panic!("{other:?}"),

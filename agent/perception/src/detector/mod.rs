@@ -23,7 +23,7 @@ use crate::layers::backbone::BevBackbone;
 use crate::layers::head::DetectionHead;
 use crate::layers::shrink::{Compressor, Shrink};
 use crate::model_config::{DetectorConfig, YAxis};
-use crate::pillars::batch::PillarLattice;
+use crate::pillars::batch::PillarGrid;
 use crate::pillars::point_pillars::PointPillars;
 use crate::pillars::projection::PillarProjection;
 use crate::pillars::voxels::Voxeliser;
@@ -39,7 +39,7 @@ pub struct Detector {
     sha256: String,
     crop: Crop,
     voxeliser: Voxeliser,
-    lattice: PillarLattice,
+    pillar_grid: PillarGrid,
     projection: PillarProjection,
     backbone: BevBackbone,
     shrink: Option<Shrink>,
@@ -74,7 +74,7 @@ impl Detector {
     /// Uses a network on the CPU, trained or not; its norms are folded into the convolutions.
     #[must_use]
     pub fn from_network(network: PointPillars) -> Self {
-        let lattice = *network.lattice();
+        let pillar_grid = *network.pillar_grid();
         let projection = PillarProjection::new(&network.encoder);
         tch::no_grad(|| Self {
             sha256: String::new(),
@@ -87,8 +87,8 @@ impl Detector {
             head: network.head,
             config: network.config,
             cropped: Vec::new(),
-            canvas: vec![0.0; lattice.width * lattice.height * projection.channels()],
-            lattice,
+            canvas: vec![0.0; pillar_grid.width * pillar_grid.height * projection.channels()],
+            pillar_grid,
             projection,
         })
     }
@@ -179,8 +179,8 @@ impl Detector {
         let pillars = self.voxeliser.voxelise(&self.cropped);
         times.lap("voxelise");
         self.canvas.fill(0.0);
-        self.projection.scatter(&pillars, &self.lattice, &mut self.canvas);
-        let (height, width) = (self.lattice.height as i64, self.lattice.width as i64);
+        self.projection.scatter(&pillars, &self.pillar_grid, &mut self.canvas);
+        let (height, width) = (self.pillar_grid.height as i64, self.pillar_grid.width as i64);
         let canvas = Tensor::f_from_slice(&self.canvas)?.f_view([1, height, width, -1])?.f_permute([0, 3, 1, 2])?;
         times.lap("pillars");
         let features = tch::no_grad(|| {
@@ -199,7 +199,7 @@ impl Detector {
     ///
     /// # Errors
     /// [`DetectorError::Shape`] if there is a compressor and the feature map is not of this detector.
-    pub fn squeezed(&self, features: &Tensor) -> Result<Tensor, DetectorError> {
+    pub fn compressed(&self, features: &Tensor) -> Result<Tensor, DetectorError> {
         let Some(compressor) = &self.compressor else { return Ok(features.shallow_clone()) };
         let map = one_map(features, self.map_shape())?;
         Ok(tch::no_grad(|| compressor.encode(&map, false).f_contiguous())?)
@@ -209,7 +209,7 @@ impl Detector {
     ///
     /// # Errors
     /// [`DetectorError::Shape`] if there is a compressor and the tensor is not a code of this detector.
-    pub fn widened(&self, sent: &Tensor) -> Result<Tensor, DetectorError> {
+    pub fn decompressed(&self, sent: &Tensor) -> Result<Tensor, DetectorError> {
         let Some(compressor) = &self.compressor else { return Ok(sent.shallow_clone()) };
         let code = one_map(sent, self.sent_shape())?;
         Ok(tch::no_grad(|| compressor.decode(&code, false).f_contiguous())?)
@@ -221,9 +221,9 @@ impl Detector {
     /// once.
     ///
     /// # Errors
-    /// As [`Self::squeezed`].
+    /// As [`Self::compressed`].
     pub fn through_compressor(&self, features: &Tensor) -> Result<Tensor, DetectorError> {
-        self.widened(&self.squeezed(features)?)
+        self.decompressed(&self.compressed(features)?)
     }
 
     /// The feature map `[1, C, H, W]` of a message, expanded if it is a code, and zero where nothing was sent.
@@ -241,7 +241,7 @@ impl Detector {
                 expected: self.sent_shape(),
             });
         }
-        let widened = self.widened(&Tensor::f_from_slice(values)?.f_view([1, expected, height, width])?)?;
+        let widened = self.decompressed(&Tensor::f_from_slice(values)?.f_view([1, expected, height, width])?)?;
         match (sent, &self.compressor) {
             // The expansion spreads the sent cells to their neighbours, and the bias everywhere.
             (Some(sent), Some(_)) => {
@@ -275,7 +275,7 @@ impl Detector {
         Ok(boxes)
     }
 
-    /// Message of a feature map in its transmitted form, see [`Self::squeezed`].
+    /// Message of a feature map in its transmitted form, see [`Self::compressed`].
     ///
     /// # Errors
     /// [`DetectorError::Shape`] if the tensor is not of this detector.
@@ -351,7 +351,7 @@ mod tests {
         let mut cropped = Vec::new();
         Crop::for_detector(&config()).keep(&cloud.xyzi, &mut cropped);
         let sweep = Voxeliser::for_detector(&config()).voxelise(&cropped);
-        let batch = PillarBatch::new(&[&sweep], pillars.lattice());
+        let batch = PillarBatch::new(&[&sweep], pillars.pillar_grid());
         let (expected, scores) = tch::no_grad(|| {
             let features = pillars.features(&batch, false);
             let scores = pillars.heads(&features).unwrap().scores;
@@ -372,7 +372,7 @@ mod tests {
         let mut cropped = Vec::new();
         Crop::for_detector(&config()).keep(&cloud().xyzi, &mut cropped);
         let sweep = Voxeliser::for_detector(&config()).voxelise(&cropped);
-        let batch = PillarBatch::new(&[&sweep], pillars.lattice());
+        let batch = PillarBatch::new(&[&sweep], pillars.pillar_grid());
         let expected = tch::no_grad(|| pillars.through_compressor(&pillars.features(&batch, false), false));
         let mut detector = Detector::from_network(pillars);
         let encoded = detector.encode(&cloud()).unwrap().features;
@@ -390,7 +390,7 @@ mod tests {
         let (_store, pillars) = network_of(&DetectorConfig { compress_ratio: Some(16), ..config() });
         let mut detector = Detector::from_network(pillars);
         let encoded = detector.encode(&cloud()).unwrap().features;
-        let features = detector.to_message(&detector.squeezed(&encoded).unwrap()).unwrap();
+        let features = detector.to_message(&detector.compressed(&encoded).unwrap()).unwrap();
         let cells = detector.grid().cells();
         assert_eq!((features.channels, features.code_of, features.values.len()), (4, Some(64), 4 * cells));
         let whole = detector.through_compressor(&encoded).unwrap();

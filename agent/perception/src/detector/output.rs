@@ -10,7 +10,7 @@ use crate::layers::head::HeadOutput;
 #[derive(Debug)]
 pub struct Encoded {
     /// `[1, C, H, W]` `f32`, contiguous, before the compressor if there is one:
-    /// [`Detector::squeezed`](super::Detector::squeezed) gives the transmitted feature map.
+    /// [`Detector::compressed`](super::Detector::compressed) gives the transmitted feature map.
     pub features: Tensor,
     /// Number of points inside the area.
     pub points: usize,

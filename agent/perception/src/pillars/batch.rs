@@ -10,7 +10,7 @@ pub const POINT_FEATURES: usize = 10;
 
 /// Grid of the pillars: converts cell indices into metres.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct PillarLattice {
+pub struct PillarGrid {
     /// Number of cells along x.
     pub width: usize,
     /// Number of cells along y.
@@ -22,7 +22,7 @@ pub struct PillarLattice {
     first_center_m: [f32; 3],
 }
 
-impl PillarLattice {
+impl PillarGrid {
     /// The pillar grid of a detector.
     #[must_use]
     pub fn new(config: &DetectorConfig) -> Self {
@@ -69,24 +69,24 @@ pub struct PillarBatch {
 impl PillarBatch {
     /// Computes the features of the points of `sweeps`, in this order.
     #[must_use]
-    pub fn new(sweeps: &[&Pillars], lattice: &PillarLattice) -> Self {
+    pub fn new(sweeps: &[&Pillars], pillar_grid: &PillarGrid) -> Self {
         let points: usize = sweeps.iter().map(|pillars| pillars.points.len()).sum();
         let total: usize = sweeps.iter().map(|pillars| pillars.len()).sum();
         let mut features = Vec::with_capacity(points * POINT_FEATURES);
         let mut cells = Vec::with_capacity(total);
         let mut counts = Vec::with_capacity(total);
         for (sweep, pillars) in sweeps.iter().enumerate() {
-            let first_cell = sweep * lattice.width * lattice.height;
+            let first_cell = sweep * pillar_grid.width * pillar_grid.height;
             for (points, coord) in pillars.iter() {
-                push_features(&mut features, points, lattice.center_m(coord));
-                cells.push((first_cell + lattice.cell(coord)) as i64);
+                push_features(&mut features, points, pillar_grid.center_m(coord));
+                cells.push((first_cell + pillar_grid.cell(coord)) as i64);
                 counts.push(points.len() as i64);
             }
         }
         let counts = Tensor::from_slice(&counts);
         Self {
             features: Tensor::from_slice(&features).view([points as i64, POINT_FEATURES as i64]),
-            partial: counts.lt(lattice.max_points as i64).unsqueeze(1),
+            partial: counts.lt(pillar_grid.max_points as i64).unsqueeze(1),
             counts,
             cells: Tensor::from_slice(&cells),
             sweeps: sweeps.len() as i64,
@@ -123,8 +123,8 @@ impl PillarBatch {
     /// - `rows`: `[M, C]`
     /// - returns: `[B, C, H, W]`, zero where there is no pillar; channels are innermost in memory, the layout that
     ///   convolutions on a CPU read fastest
-    pub fn scatter(&self, rows: &Tensor, lattice: &PillarLattice) -> Tensor {
-        let (height, width) = (lattice.height as i64, lattice.width as i64);
+    pub fn scatter(&self, rows: &Tensor, pillar_grid: &PillarGrid) -> Tensor {
+        let (height, width) = (pillar_grid.height as i64, pillar_grid.width as i64);
         let channels = rows.size()[1];
         let canvas = Tensor::zeros([self.sweeps * height * width, channels], (Kind::Float, rows.device()));
         let canvas = canvas.index_copy(0, &self.cells, rows);

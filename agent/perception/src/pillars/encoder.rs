@@ -58,7 +58,7 @@ mod tests {
 
     use super::*;
     use crate::model_config::DetectorConfig;
-    use crate::pillars::batch::PillarLattice;
+    use crate::pillars::batch::PillarGrid;
     use crate::pillars::voxels::{Pillars, Voxeliser};
 
     /// Pillars with one to five points, some of them full.
@@ -95,7 +95,7 @@ mod tests {
         let network = VarStore::new(Device::Cpu);
         let encoder = PillarEncoder::new(&network.root(), 16);
         let _ = tch::no_grad(|| encoder.norm.bias().shallow_clone().uniform_(-0.5, 0.5));
-        let batch = PillarBatch::new(&[&pillars(&config)], &PillarLattice::new(&config));
+        let batch = PillarBatch::new(&[&pillars(&config)], &PillarGrid::new(&config));
         assert_eq!(batch.counts.max().int64_value(&[]), 5);
         let weights = Tensor::randn([batch.counts.size()[0], 16], (Kind::Float, Device::Cpu));
         let mut results = Vec::new();

@@ -6,7 +6,7 @@ use crate::layers::backbone::BevBackbone;
 use crate::layers::head::{DetectionHead, HeadOutput};
 use crate::layers::shrink::{Compressor, Shrink};
 use crate::model_config::{ConfigError, DetectorConfig};
-use crate::pillars::batch::{PillarBatch, PillarLattice};
+use crate::pillars::batch::{PillarBatch, PillarGrid};
 use crate::pillars::encoder::PillarEncoder;
 
 /// The detector's network. Parameter names are those of the reference's state dictionary.
@@ -14,7 +14,7 @@ use crate::pillars::encoder::PillarEncoder;
 pub struct PointPillars {
     /// Configuration that it was built from.
     pub config: DetectorConfig,
-    lattice: PillarLattice,
+    pillar_grid: PillarGrid,
     /// Precision of the convolutions in training: `Float`, or `BFloat16` if the CPU computes it several times as fast.
     /// Parameters, norms, pillar features and heads are `f32` in any case.
     pub compute: Kind,
@@ -39,7 +39,7 @@ impl PointPillars {
         config.validate()?;
         let channels = config.feature_channels();
         Ok(Self {
-            lattice: PillarLattice::new(config),
+            pillar_grid: PillarGrid::new(config),
             compute: Kind::Float,
             encoder: PillarEncoder::new(&(path / "pillar_vfe"), config.pillar_channels),
             backbone: BevBackbone::new(&(path / "backbone"), config),
@@ -54,13 +54,13 @@ impl PointPillars {
 
     /// Grid of the pillars on the canvas.
     #[must_use]
-    pub fn lattice(&self) -> &PillarLattice {
-        &self.lattice
+    pub fn pillar_grid(&self) -> &PillarGrid {
+        &self.pillar_grid
     }
 
     /// Feature map of every sweep: `[B, C, H, W]`, before the compressor.
     pub fn features(&self, batch: &PillarBatch, train: bool) -> Tensor {
-        let canvas = batch.scatter(&self.encoder.forward(batch, train), &self.lattice);
+        let canvas = batch.scatter(&self.encoder.forward(batch, train), &self.pillar_grid);
         self.features_of_canvas(&canvas, train)
     }
 
@@ -107,7 +107,7 @@ mod tests {
         let points: Vec<[f32; 4]> =
             (0..500).map(|k| [k as f32 * 0.02 - 5.0, (k % 50) as f32 * 0.2 - 5.0, -1.0, 0.5]).collect();
         let pillars = Voxeliser::for_detector(config).voxelise(&points);
-        PillarBatch::new(&[&pillars, &pillars], &PillarLattice::new(config))
+        PillarBatch::new(&[&pillars, &pillars], &PillarGrid::new(config))
     }
 
     /// Loss before and after a few steps towards an arbitrary target.

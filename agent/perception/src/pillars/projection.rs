@@ -2,7 +2,7 @@
 
 use tch::{Kind, Tensor};
 
-use crate::pillars::batch::{POINT_FEATURES, PillarLattice, mean_xyz};
+use crate::pillars::batch::{POINT_FEATURES, PillarGrid, mean_xyz};
 use crate::pillars::encoder::PillarEncoder;
 use crate::pillars::voxels::Pillars;
 
@@ -75,11 +75,11 @@ impl PillarProjection {
     ///
     /// # Panics
     /// When the canvas is smaller than the pillar grid.
-    pub fn scatter(&self, pillars: &Pillars, lattice: &PillarLattice, canvas: &mut [f32]) {
+    pub fn scatter(&self, pillars: &Pillars, pillar_grid: &PillarGrid, canvas: &mut [f32]) {
         for (points, coord) in pillars.iter() {
-            let cell = lattice.cell(coord) * self.channels;
-            let center = lattice.center_m(coord);
-            let has_free_slot = points.len() < lattice.max_points;
+            let cell = pillar_grid.cell(coord) * self.channels;
+            let center = pillar_grid.center_m(coord);
+            let has_free_slot = points.len() < pillar_grid.max_points;
             self.pillar(points, center, has_free_slot, &mut canvas[cell..cell + self.channels]);
         }
     }
@@ -142,12 +142,12 @@ mod tests {
             })
             .collect();
         let pillars = Voxeliser::for_detector(&config).voxelise(&points);
-        let lattice = PillarLattice::new(&config);
-        let batch = PillarBatch::new(&[&pillars], &lattice);
-        let expected = tch::no_grad(|| batch.scatter(&encoder.forward(&batch, false), &lattice));
-        let mut canvas = vec![0.0; lattice.width * lattice.height * 24];
-        PillarProjection::new(&encoder).scatter(&pillars, &lattice, &mut canvas);
-        let shape = [1, lattice.height as i64, lattice.width as i64, 24];
+        let pillar_grid = PillarGrid::new(&config);
+        let batch = PillarBatch::new(&[&pillars], &pillar_grid);
+        let expected = tch::no_grad(|| batch.scatter(&encoder.forward(&batch, false), &pillar_grid));
+        let mut canvas = vec![0.0; pillar_grid.width * pillar_grid.height * 24];
+        PillarProjection::new(&encoder).scatter(&pillars, &pillar_grid, &mut canvas);
+        let shape = [1, pillar_grid.height as i64, pillar_grid.width as i64, 24];
         let actual = Tensor::from_slice(&canvas).view(shape).permute([0, 3, 1, 2]);
         assert!(actual.allclose(&expected, 1e-5, 2e-5, false));
     }

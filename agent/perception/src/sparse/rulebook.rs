@@ -84,12 +84,12 @@ impl Rulebook {
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub fn stacked<'a>(books: impl IntoIterator<Item = &'a Self>, device: Device) -> Result<GatherIndex, TchError> {
-        let books: Vec<&Self> = books.into_iter().collect();
-        let inputs: usize = books.iter().map(|book| book.inputs).sum();
-        let mut index = Vec::with_capacity(books.iter().map(|book| book.rows.len()).sum());
+    pub fn stacked<'a>(rulebooks: impl IntoIterator<Item = &'a Self>, device: Device) -> Result<GatherIndex, TchError> {
+        let rulebooks: Vec<&Self> = rulebooks.into_iter().collect();
+        let inputs: usize = rulebooks.iter().map(|book| book.inputs).sum();
+        let mut index = Vec::with_capacity(rulebooks.iter().map(|book| book.rows.len()).sum());
         let mut first = 0;
-        for book in books {
+        for book in rulebooks {
             index.extend(book.rows.iter().map(|&row| if row == NONE { inputs as i64 } else { first + i64::from(row) }));
             first += book.inputs as i64;
         }

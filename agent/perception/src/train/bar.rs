@@ -67,7 +67,7 @@ impl TrainingBar {
         let passed = encoding.began.elapsed();
         let remaining_s = remaining_s((done - encoding.first) as f64, left, passed.as_secs_f64());
         if let Some(remaining_s) = remaining_s.filter(|_| !encoding.is_estimated && passed >= ESTIMATE_AFTER) {
-            self.say(&estimate(all, passed.as_secs_f64() + remaining_s, self.length));
+            self.print_line(&estimate(all, passed.as_secs_f64() + remaining_s, self.length));
             encoding.is_estimated = true;
         }
         self.encoding.set(Some(encoding));
@@ -86,7 +86,7 @@ impl TrainingBar {
     }
 
     /// Prints a line that stays.
-    pub fn say(&self, text: &str) {
+    pub fn print_line(&self, text: &str) {
         if self.is_watched { self.bar.println(text) } else { output::note(text) }
     }
 

@@ -13,7 +13,7 @@ use serde::Serialize;
 use sim_replay::config::{LinkProcessConfig, RecorderConfig, ReplayConfig, SensorLinkConfig, WaitConfig};
 
 use super::{Fleet, RECORDER, REPLAY};
-use crate::operate::run_folder::{BOOKMARK, RECORDING, RunFolder, RunFolderError, SWEEP_LOG};
+use crate::operate::run_folder::{CHECKPOINT, RECORDING, RunFolder, RunFolderError, SWEEP_LOG};
 use crate::operate::security::RunKeys;
 use crate::operate::supervise::{ProcessSpec, RestartPolicy};
 use crate::scenario::Clock;
@@ -153,7 +153,7 @@ impl Fleet {
                 ..WaitConfig::default()
             },
             sensor_link: SensorLinkConfig::default(),
-            bookmark: Some(context.folder.file(BOOKMARK)),
+            checkpoint: Some(context.folder.file(CHECKPOINT)),
             bus,
         }
     }

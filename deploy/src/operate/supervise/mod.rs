@@ -3,7 +3,7 @@
 //! The standard input of every process is a parent-death pipe: the supervisor holds the other end and never writes, so
 //! that any end of the supervisor ends the fleet.
 
-mod said;
+mod log_lines;
 #[cfg(test)]
 mod tests;
 mod watcher;
@@ -65,7 +65,7 @@ pub enum ProcessEventKind {
         pid: u32,
     },
     /// It crashed and will be restarted after a pause.
-    Fell {
+    Crashed {
         /// Description of its end.
         how: String,
         /// Length of the pause.
@@ -81,7 +81,7 @@ pub enum ProcessEventKind {
         is_optional: bool,
     },
     /// It printed a line of its report.
-    Said {
+    Logged {
         /// The line.
         line: String,
     },

@@ -12,7 +12,7 @@ use tokio::process::{Child, Command};
 use tokio::sync::{mpsc, watch};
 use tokio::task::JoinHandle;
 
-use super::{ProcessEvent, ProcessEventKind, ProcessSpec, RestartPolicy, SuperviseError, said};
+use super::{ProcessEvent, ProcessEventKind, ProcessSpec, RestartPolicy, SuperviseError, log_lines};
 
 /// Exit code of our programs for bad usage or input: a restart cannot help.
 const BAD_INPUT: i32 = 2;
@@ -119,7 +119,7 @@ impl Watcher {
             }
             let pause = LONGEST_PAUSE.min(FIRST_PAUSE * (1 << (self.crashes - 1).min(5)));
             self.restarted += 1;
-            self.report(ProcessEventKind::Fell { how, again_after: pause, restart: self.restarted });
+            self.report(ProcessEventKind::Crashed { how, again_after: pause, restart: self.restarted });
             tokio::select! {
                 () = tokio::time::sleep(pause) => {}
                 _ = stop_requested(self.stop.clone()) => return false,
@@ -157,8 +157,8 @@ impl Watcher {
     fn follow(&self, child: &mut Child) -> Option<JoinHandle<()>> {
         let (output, log) = (child.stdout.take()?, self.log.file.try_clone().ok()?);
         let (events, name) = (self.events.clone(), self.spec.name.clone());
-        Some(tokio::spawn(said::follow(output, log, move |line| {
-            let _ = events.send(ProcessEvent { name: name.clone(), what: ProcessEventKind::Said { line } });
+        Some(tokio::spawn(log_lines::follow(output, log, move |line| {
+            let _ = events.send(ProcessEvent { name: name.clone(), what: ProcessEventKind::Logged { line } });
         })))
     }
 

@@ -16,7 +16,7 @@ pub use resources::{ProcessResources, StageTimes, StreamBytes};
 
 use crate::run::capacity::Capacity;
 use crate::score::metrics::Metrics;
-use crate::score::{FrameRecord, ProcessBooks};
+use crate::score::{FrameRecord, ProcessStats};
 
 /// File name.
 pub const FILE: &str = "report.json";
@@ -95,7 +95,7 @@ impl RunReport {
         run: &RunId,
         metrics: &Metrics,
         records: &[FrameRecord],
-        processes: &[ProcessBooks],
+        processes: &[ProcessStats],
         capacity: Option<Capacity>,
     ) -> Self {
         let latencies: Vec<f64> = records.iter().filter_map(|record| record.latency_ms).collect();

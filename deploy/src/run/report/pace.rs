@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::Spread;
 use crate::score::metrics::Metrics;
-use crate::score::{FrameRecord, ProcessBooks};
+use crate::score::{FrameRecord, ProcessStats};
 
 /// Stage that an agent times once for every sweep that it computes in full.
 const WHOLE_SWEEP: &str = "agent";
@@ -39,7 +39,7 @@ pub struct AgentPace {
 }
 
 impl Pace {
-    pub(super) fn of(metrics: &Metrics, records: &[FrameRecord], processes: &[ProcessBooks]) -> Self {
+    pub(super) fn of(metrics: &Metrics, records: &[FrameRecord], processes: &[ProcessStats]) -> Self {
         let mut published_s: Vec<f64> = records.iter().filter_map(published_s).collect();
         published_s.sort_by(f64::total_cmp);
         let intervals_ms: Vec<f64> = published_s.windows(2).map(|pair| (pair[1] - pair[0]) * 1e3).collect();
@@ -74,7 +74,7 @@ fn published_s(record: &FrameRecord) -> Option<f64> {
     Some(began_s(record) + record.latency_ms? * 1e-3)
 }
 
-fn agents(processes: &[ProcessBooks], ticks: u64) -> BTreeMap<String, AgentPace> {
+fn agents(processes: &[ProcessStats], ticks: u64) -> BTreeMap<String, AgentPace> {
     let mut agents = BTreeMap::<String, AgentPace>::new();
     for books in processes {
         let Some(cav) = vehicle_of(&books.process) else { continue };
@@ -91,6 +91,6 @@ fn vehicle_of(process: &ProcessId) -> Option<&str> {
 }
 
 /// Number of sweeps that an agent has computed.
-pub(super) fn sweeps(books: &ProcessBooks) -> u64 {
+pub(super) fn sweeps(books: &ProcessStats) -> u64 {
     books.stages.iter().find(|stage| stage.stage == WHOLE_SWEEP).map_or(0, |stage| stage.count)
 }

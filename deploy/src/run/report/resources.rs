@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::Pace;
 use super::pace::sweeps;
-use crate::score::ProcessBooks;
+use crate::score::ProcessStats;
 
 /// Durations of one stage in the processes of one kind. Of several processes those of the slowest, for which the ego
 /// waits.
@@ -61,7 +61,7 @@ pub struct StreamBytes {
 }
 
 /// Stages by kind of process, in the order of the data flow, then of their names.
-pub(super) fn stages(processes: &[ProcessBooks]) -> Vec<StageTimes> {
+pub(super) fn stages(processes: &[ProcessStats]) -> Vec<StageTimes> {
     let mut all = BTreeMap::<(usize, String, String), StageTimes>::new();
     for books in processes {
         let (order, kind) = kind_of(books.process.as_str());
@@ -96,7 +96,7 @@ fn kind_of(process: &str) -> (usize, String) {
 }
 
 /// CPU time and memory of every process, in the order of the data flow.
-pub(super) fn processes(processes: &[ProcessBooks], pace: &Pace) -> Vec<ProcessResources> {
+pub(super) fn processes(processes: &[ProcessStats], pace: &Pace) -> Vec<ProcessResources> {
     let mut all = BTreeMap::<(usize, String), (ProcessResources, u64)>::new();
     for books in processes {
         let name = books.process.to_string();
@@ -133,7 +133,7 @@ fn nothing_of(process: String) -> ProcessResources {
 }
 
 /// Published bytes by stream, the largest first.
-pub(super) fn streams(processes: &[ProcessBooks]) -> Vec<StreamBytes> {
+pub(super) fn streams(processes: &[ProcessStats]) -> Vec<StreamBytes> {
     let mut sums = BTreeMap::<String, (u64, u64)>::new();
     for traffic in processes.iter().flat_map(|books| &books.traffic) {
         let stream = match &traffic.topic {

@@ -32,9 +32,9 @@ fn record(tick: u64, latency_ms: Option<f64>) -> FrameRecord {
 }
 
 /// A process with one stage, its CPU time in total and before the first tick, and one published topic.
-fn process(name: &str, (stage, count, p50_ms): (&str, u64, f64), cpu_s: [f64; 2], topic: &str) -> ProcessBooks {
+fn process(name: &str, (stage, count, p50_ms): (&str, u64, f64), cpu_s: [f64; 2], topic: &str) -> ProcessStats {
     let (p95_ms, p99_ms, max_ms) = (2.0 * p50_ms, 2.5 * p50_ms, 3.0 * p50_ms);
-    ProcessBooks {
+    ProcessStats {
         process: name.parse().unwrap(),
         ledger: Ledger::default(),
         stages: vec![StageSummary { stage: stage.into(), count, p50_ms, p95_ms, p99_ms, max_ms }],

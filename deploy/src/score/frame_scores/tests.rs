@@ -1,6 +1,6 @@
 use dataset::class_set::ClassSet;
 use protocol::{
-    AgentTruth, Detection, FusedNeighbour, HeardNeighbour, MisbehaviourReason, SkippedNeighbour, TrueObject,
+    AgentTruth, Detection, FusedNeighbour, MisbehaviourReason, NeighbourState, SkippedNeighbour, TrueObject,
 };
 
 use super::super::open_ticks::MOST_OPEN;
@@ -66,10 +66,10 @@ fn result(tick: u64, at_x: &[f64]) -> Detections {
             wire_bytes: 1300,
         }],
         skipped: vec![],
-        heard: vec![HeardNeighbour {
+        neighbours: vec![NeighbourState {
             cav: cav("n"),
             trust: Some(0.5 + 0.25 * tick as f64),
-            doubt: None,
+            misbehaviour: None,
             clock_offset_s: Some(0.125),
         }],
         stages: vec![],
@@ -189,27 +189,31 @@ fn a_long_run_keeps_few_ticks_open() {
 #[test]
 fn neighbours_are_followed_over_the_run() {
     let mut board = FrameScores::new(cav("e"), RULE, 1);
-    let doubted = Detections {
+    let misbehaving = Detections {
         fused: vec![],
-        skipped: vec![SkippedNeighbour { cav: cav("n"), reason: Some(DropReason::Distrusted) }],
-        heard: vec![HeardNeighbour {
+        skipped: vec![SkippedNeighbour { cav: cav("n"), reason: Some(DropReason::Misbehaviour) }],
+        neighbours: vec![NeighbourState {
             cav: cav("n"),
             trust: Some(0.25),
-            doubt: Some(MisbehaviourReason::GhostObjects),
+            misbehaviour: Some(MisbehaviourReason::GhostObjects),
             clock_offset_s: None,
         }],
         ..result(1, &[])
     };
-    for (tick, result) in [(0, result(0, &[])), (1, doubted)] {
+    for (tick, result) in [(0, result(0, &[])), (1, misbehaving)] {
         board.truth(&stamp("replay", tick, 100 * tick), truth(tick));
         board.result(&stamp("e", tick, 100 * tick + 50), result);
     }
     board.close();
     let record = &board.neighbours()[&cav("n")];
     assert_eq!(
-        (record.fused, record.left_out[&DropReason::Distrusted], record.doubts[&MisbehaviourReason::GhostObjects]),
+        (
+            record.fused,
+            record.left_out[&DropReason::Misbehaviour],
+            record.misbehaviour_counts[&MisbehaviourReason::GhostObjects]
+        ),
         (1, 1, 1)
     );
     assert_eq!((record.trust, record.least_trust), (Some(0.25), Some(0.25)));
-    assert_eq!((record.doubt, record.clock_offset_s), (Some(MisbehaviourReason::GhostObjects), Some(0.125)));
+    assert_eq!((record.misbehaviour, record.clock_offset_s), (Some(MisbehaviourReason::GhostObjects), Some(0.125)));
 }

@@ -134,11 +134,12 @@ impl Motion {
             from.f_get(1)? * (2.0 / height_m),
         ];
         let theta = Tensor::f_stack(&entries, 0)?.f_view([1, 2, 3])?;
-        let lattice = Tensor::f_affine_grid_generator(&theta, [1, channels, height, width], false)?;
+        let sampling_grid = Tensor::f_affine_grid_generator(&theta, [1, channels, height, width], false)?;
         let maps =
-            map.f_permute([2, 0, 1])?.f_unsqueeze(0)?.f_grid_sampler(&lattice, BILINEAR, PADDING_ZEROS, false)?;
+            map.f_permute([2, 0, 1])?.f_unsqueeze(0)?.f_grid_sampler(&sampling_grid, BILINEAR, PADDING_ZEROS, false)?;
         let mask = mask.f_view([1, 1, height, width])?;
-        let mask = mask.f_grid_sampler(&lattice.f_detach()?, NEAREST, PADDING_ZEROS, false)?.f_view([height, width])?;
+        let mask =
+            mask.f_grid_sampler(&sampling_grid.f_detach()?, NEAREST, PADDING_ZEROS, false)?.f_view([height, width])?;
         let moved = maps.f_squeeze_dim(0)?.f_permute([1, 2, 0])? * mask.f_unsqueeze(2)?;
         Ok((moved.f_contiguous()?, mask))
     }

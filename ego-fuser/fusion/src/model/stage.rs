@@ -39,7 +39,7 @@ pub struct FusionStage {
     config: FusionConfig,
     requirements: Requirements,
     fusion: Box<dyn Fusion>,
-    steering: Option<ChannelMixing>,
+    mixing: Option<ChannelMixing>,
     /// For a fusion that needs earlier maps at full resolution.
     classes: Option<Classes>,
     grid: BevGrid,
@@ -61,13 +61,13 @@ impl FusionStage {
         detector: &DetectorConfig,
     ) -> Result<Self, ConfigError> {
         let shares_maps = method.exchange() == Exchange::Features;
-        let steering = shares_maps.then(|| ChannelMixing::new(path, detector.feature_channels()));
+        let mixing = shares_maps.then(|| ChannelMixing::new(path, detector.feature_channels()));
         let fusion = config.build(&(path / "fusion"))?;
         let sizes = [detector.feature_channels(), detector.anchors.yaws_deg.len() as i64];
         let requirements = config.requirements();
         let classes = requirements.history.full_resolution.then(|| Classes::under(path, sizes));
         let (grid, y_axis) = (detector.feature_grid(), detector.y_axis);
-        Ok(Self { config: config.clone(), requirements, fusion, steering, classes, grid, y_axis })
+        Ok(Self { config: config.clone(), requirements, fusion, mixing, classes, grid, y_axis })
     }
 
     /// The fusion of a weights file, or the one of `method` where it differs and has no parameters.
@@ -80,7 +80,7 @@ impl FusionStage {
         let mut stage = Self::new(&variables.root(), &config, method, detector)?;
         weights.copy_some_into(&variables, |name| name != channel_mixing::WEIGHT || weights.contains(name))?;
         if !weights.contains(channel_mixing::WEIGHT) {
-            stage.steering = None;
+            stage.mixing = None;
         }
         Ok(stage)
     }
@@ -93,7 +93,7 @@ impl FusionStage {
     pub fn untrained(method: Method, detector: &DetectorConfig) -> Result<Self, ConfigError> {
         let variables = VarStore::new(Device::Cpu);
         let config = method.default_fusion(detector);
-        Ok(Self { steering: None, ..Self::new(&variables.root(), &config, method, detector)? })
+        Ok(Self { mixing: None, ..Self::new(&variables.root(), &config, method, detector)? })
     }
 
     /// Settings that the fusion was built from.
@@ -150,8 +150,8 @@ impl FusionStage {
 
     /// Maps in the axes of the ego.
     fn turned(&self, maps: &Tensor, poses: &[Pose]) -> Result<Tensor, TchError> {
-        match &self.steering {
-            Some(steering) => steering.turn(maps, poses),
+        match &self.mixing {
+            Some(mixing) => mixing.turn(maps, poses),
             None => Ok(maps.shallow_clone()),
         }
     }

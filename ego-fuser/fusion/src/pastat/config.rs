@@ -195,7 +195,7 @@ impl PastatConfig {
             ("pastat mlp_ratio", self.mlp_ratio, 16),
             ("pastat depth", i64::try_from(self.depth).unwrap_or(i64::MAX), 32),
             ("pastat refine", self.map_refinement.unwrap_or(1), 4096),
-            ("pastat recall hidden", self.temporal_memory.map_or(1, |memory| memory.hidden), 4096),
+            ("pastat temporal memory hidden", self.temporal_memory.map_or(1, |memory| memory.hidden), 4096),
             ("pastat frames", i64::try_from(self.frames).unwrap_or(i64::MAX), 16),
         ] {
             if !(1..=most).contains(&value) {
@@ -224,7 +224,7 @@ impl PastatConfig {
         if let Some(MemoryConfig { share, .. }) = self.temporal_memory
             && !(share > 0.0 && share <= 1.0)
         {
-            return error("pastat recall share", share.to_string(), "above 0, up to 1");
+            return error("pastat temporal memory share", share.to_string(), "above 0, up to 1");
         }
         if self.temporal_memory.is_some() && self.frames < 2 {
             return error("pastat frames", self.frames.to_string(), "2 or more, as earlier maps are blended in");
@@ -285,7 +285,7 @@ mod tests {
 
     #[test]
     fn invalid_settings_are_named() {
-        let recall = |memory| PastatConfig { temporal_memory: Some(memory), ..PastatConfig::lean(64) };
+        let with_memory = |memory| PastatConfig { temporal_memory: Some(memory), ..PastatConfig::lean(64) };
         for (config, part) in [
             (PastatConfig { dim: 36, ..PastatConfig::lean(64) }, "dim is 36"),
             (PastatConfig { windows: vec![4, 8, 16], ..PastatConfig::lean(64) }, "windows is [4, 8, 16]"),
@@ -301,8 +301,8 @@ mod tests {
                 "search cells is 3",
             ),
             (PastatConfig { frames: 1, ..PastatConfig::lean(64) }, "frames is 1"),
-            (recall(MemoryConfig { hidden: 0, ..MemoryConfig::default() }), "recall hidden is 0"),
-            (recall(MemoryConfig { share: f64::NAN, ..MemoryConfig::default() }), "recall share is NaN"),
+            (with_memory(MemoryConfig { hidden: 0, ..MemoryConfig::default() }), "temporal memory hidden is 0"),
+            (with_memory(MemoryConfig { share: f64::NAN, ..MemoryConfig::default() }), "temporal memory share is NaN"),
             (PastatConfig { frames: 0, ..PastatConfig::lean(64) }, "frames is 0"),
             (PastatConfig { frame_secs: f64::NAN, ..PastatConfig::lean(64) }, "frame_secs is NaN"),
         ] {

@@ -43,7 +43,7 @@ pub struct Corrected {
 const HALF_EXACT_M: f64 = 60.0;
 
 /// A box of an agent, in the plane.
-struct Seen {
+struct ObservedBox {
     /// In the frame of the agent, height left out.
     center: Vector3<f64>,
     heading_rad: f64,
@@ -51,7 +51,7 @@ struct Seen {
     std_rad: f64,
 }
 
-impl Seen {
+impl ObservedBox {
     fn new(found: &Detection, config: &PoseGraphConfig) -> Option<Self> {
         let [x, y, _] = found.box3d.center_m;
         let center = Vector3::new(x, y, 0.0);
@@ -69,7 +69,7 @@ impl Seen {
 /// the ego may still be aligned through a third.
 #[must_use]
 pub fn correct(agents: &[Observer<'_>], config: &PoseGraphConfig) -> Vec<Corrected> {
-    let seen: Vec<Vec<Seen>> = agents.iter().map(|agent| sound_boxes(agent.boxes, config)).collect();
+    let seen: Vec<Vec<ObservedBox>> = agents.iter().map(|agent| sound_boxes(agent.boxes, config)).collect();
     let priors: Vec<Isometry3<f64>> = agents.iter().map(|agent| flattened(&agent.ego_from_agent)).collect();
     let unmoved = || agents.iter().map(|agent| Corrected { ego_from_agent: agent.ego_from_agent, shared: 0 }).collect();
     let Some(own) = seen.first() else { return Vec::new() };
@@ -96,18 +96,18 @@ pub fn correct(agents: &[Observer<'_>], config: &PoseGraphConfig) -> Vec<Correct
 }
 
 /// Mean distance between the boxes before and after.
-fn moved_by(seen: &[Seen], before: &Isometry3<f64>, after: &Isometry3<f64>) -> f64 {
-    let moved = |seen: &Seen| {
+fn moved_by(seen: &[ObservedBox], before: &Isometry3<f64>, after: &Isometry3<f64>) -> f64 {
+    let moved = |seen: &ObservedBox| {
         let [old, new] = [before, after].map(|pose| pose.rotation * seen.center + pose.translation.vector);
         (new - old).norm()
     };
     seen.iter().map(moved).sum::<f64>() / seen.len().max(1) as f64
 }
 
-fn sound_boxes(boxes: &[Detection], config: &PoseGraphConfig) -> Vec<Seen> {
+fn sound_boxes(boxes: &[Detection], config: &PoseGraphConfig) -> Vec<ObservedBox> {
     let mut sorted: Vec<&Detection> = boxes.iter().collect();
     sorted.sort_by(|a, b| b.score.total_cmp(&a.score));
-    sorted.into_iter().filter_map(|found| Seen::new(found, config)).take(config.max_boxes).collect()
+    sorted.into_iter().filter_map(|found| ObservedBox::new(found, config)).take(config.max_boxes).collect()
 }
 
 /// Planar position and heading.
@@ -135,7 +135,7 @@ impl Assembly {
     fn next(
         &self,
         waiting: &[usize],
-        seen: &[Vec<Seen>],
+        seen: &[Vec<ObservedBox>],
         priors: &[Isometry3<f64>],
         config: &PoseGraphConfig,
     ) -> Option<(usize, consensus::Consensus)> {
@@ -149,7 +149,13 @@ impl Assembly {
     }
 
     /// `matches` are pairs of object and box; boxes without an object create one.
-    fn join(&mut self, agent: usize, ego_from_agent: &Isometry3<f64>, seen: &[Seen], matches: &[(usize, usize)]) {
+    fn join(
+        &mut self,
+        agent: usize,
+        ego_from_agent: &Isometry3<f64>,
+        seen: &[ObservedBox],
+        matches: &[(usize, usize)],
+    ) {
         let node = self.joined.len();
         let heading = ego_from_agent.rotation.euler_angles().2;
         for (index, seen) in seen.iter().enumerate() {

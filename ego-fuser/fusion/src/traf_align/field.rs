@@ -58,11 +58,11 @@ impl Trajectories {
         let (weight, bias) = &self.offsets;
         let offsets =
             self.before_offsets.forward(&field, train).f_conv2d(weight, Some(bias), [1, 1], [1, 1], [1, 1], 1)?;
-        self.lattice(&offsets)
+        self.sampling_grid(&offsets)
     }
 
     /// Offsets `[A, 2 K, h, w]` in tokens, x of all points and then y, around the points of a square.
-    fn lattice(&self, offsets: &Tensor) -> Result<Tensor, TchError> {
+    fn sampling_grid(&self, offsets: &Tensor) -> Result<Tensor, TchError> {
         let (agents, channels, height, width) = offsets.size4()?;
         let (points, options) = (channels / 2, (Kind::Float, offsets.device()));
         let middle = (self.kernel - 1) as f64 / 2.0;
@@ -77,8 +77,8 @@ impl Trajectories {
         let x = offsets.f_narrow(1, 0, points)? + of_points(true)? + along(width, [1, 1, 1, width])?;
         let y = offsets.f_narrow(1, points, points)? + of_points(false)? + along(height, [1, 1, height, 1])?;
         let scaled = |place: Tensor, size: i64| (place + 0.5) * (2.0 / size as f64) - 1.0;
-        let lattice = Tensor::f_stack(&[scaled(x, width), scaled(y, height)], -1)?;
-        lattice.f_view([agents, points * height, width, 2])
+        let sampling_grid = Tensor::f_stack(&[scaled(x, width), scaled(y, height)], -1)?;
+        sampling_grid.f_view([agents, points * height, width, 2])
     }
 }
 

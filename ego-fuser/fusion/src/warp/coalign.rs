@@ -28,8 +28,8 @@ pub fn normalized(pairwise: &Tensor, height: i64, width: i64, pixel_m: f64) -> R
 /// # Errors
 /// [`TchError`] when shapes do not fit.
 pub fn warp_affine(source: &Tensor, matrix: &Tensor) -> Result<Tensor, TchError> {
-    let lattice = Tensor::f_affine_grid_generator(&matrix.f_to_kind(Kind::Float)?, source.size(), false)?;
-    source.f_grid_sampler(&lattice.f_to_kind(source.kind())?, BILINEAR, PADDING_ZEROS, false)
+    let sampling_grid = Tensor::f_affine_grid_generator(&matrix.f_to_kind(Kind::Float)?, source.size(), false)?;
+    source.f_grid_sampler(&sampling_grid.f_to_kind(source.kind())?, BILINEAR, PADDING_ZEROS, false)
 }
 
 #[cfg(test)]

@@ -134,8 +134,8 @@ pub(crate) fn warp_in_order(
             masks.push(sent.f_to_kind(features.kind())?);
             continue;
         }
-        let lattice = lattice(*affine, grid)?.f_to_device(features.device())?;
-        let (map, mask) = read(&map, &sent, &lattice, order)?;
+        let sampling_grid = sampling_grid(*affine, grid)?.f_to_device(features.device())?;
+        let (map, mask) = read(&map, &sent, &sampling_grid, order)?;
         moved.push(map);
         masks.push(mask);
     }
@@ -147,7 +147,7 @@ pub(crate) fn warp_in_order(
 }
 
 /// Positions of a grid's cells under an affine map of normalised coordinates, `[1, h, w, 2]` for `grid_sampler`.
-fn lattice(affine: [f32; 6], grid: &BevGrid) -> Result<Tensor, TchError> {
+fn sampling_grid(affine: [f32; 6], grid: &BevGrid) -> Result<Tensor, TchError> {
     let [rows, columns] = [grid.height, grid.width].map(|count| count as usize);
     let row = |row| (0..columns).flat_map(move |column| place_of([row, column], affine, grid));
     let places: Vec<f32> = (0..rows).flat_map(row).collect();
@@ -178,21 +178,21 @@ fn one_after_another(maps: &[Tensor]) -> Result<Tensor, TchError> {
     Tensor::f_cat(&cells, 0)?.f_permute([0, 3, 1, 2])
 }
 
-/// A map `[1, C, H, W]` and the mask of its sent cells `[1, 1, H, W]`, sampled at `lattice` `[1, h, w, 2]`.
-fn read(map: &Tensor, sent: &Tensor, lattice: &Tensor, order: Order) -> Result<(Tensor, Tensor), TchError> {
+/// A map `[1, C, H, W]` and the mask of its sent cells `[1, 1, H, W]`, sampled at `sampling_grid` `[1, h, w, 2]`.
+fn read(map: &Tensor, sent: &Tensor, sampling_grid: &Tensor, order: Order) -> Result<(Tensor, Tensor), TchError> {
     if !are_numbers(map) {
-        return read_by_tensors(map, sent, lattice);
+        return read_by_tensors(map, sent, sampling_grid);
     }
     let first = |tensor: &Tensor| tensor.f_squeeze_dim(0);
-    let (map, mask) = Cells::of(&first(map)?)?.read(&first(&first(sent)?)?, &first(lattice)?, order)?;
+    let (map, mask) = Cells::of(&first(map)?)?.read(&first(&first(sent)?)?, &first(sampling_grid)?, order)?;
     Ok((as_batch(&map)?, mask.f_unsqueeze(0)?))
 }
 
 /// [`read`] on any device, in any precision, with gradients.
-fn read_by_tensors(map: &Tensor, sent: &Tensor, lattice: &Tensor) -> Result<(Tensor, Tensor), TchError> {
-    let mask = sent.f_grid_sampler(lattice, NEAREST, PADDING_ZEROS, false)?.f_to_kind(map.kind())?;
-    let lattice = lattice.f_to_kind(map.kind())?;
-    Ok((map.f_grid_sampler(&lattice, BILINEAR, PADDING_ZEROS, false)? * &mask, mask))
+fn read_by_tensors(map: &Tensor, sent: &Tensor, sampling_grid: &Tensor) -> Result<(Tensor, Tensor), TchError> {
+    let mask = sent.f_grid_sampler(sampling_grid, NEAREST, PADDING_ZEROS, false)?.f_to_kind(map.kind())?;
+    let sampling_grid = sampling_grid.f_to_kind(map.kind())?;
+    Ok((map.f_grid_sampler(&sampling_grid, BILINEAR, PADDING_ZEROS, false)? * &mask, mask))
 }
 
 fn shape_error(found: Vec<i64>, grid: &BevGrid) -> WarpError {
@@ -290,12 +290,12 @@ mod tests {
             let map = uniform(seed, &[1, channels, 16, 32]);
             let sent = uniform(seed + 1, &[1, 1, 16, 32]).gt(0.3).to_kind(Kind::Float);
             let affine = cav_from_ego_normalized(&Pose::from_xyz_yaw([x_m, y_m, 0.0], yaw), &GRID);
-            let lattice = lattice(affine, &GRID).unwrap();
+            let sampling_grid = sampling_grid(affine, &GRID).unwrap();
             let theta = Tensor::from_slice(&affine).view([1, 2, 3]);
-            let apart = &lattice - Tensor::affine_grid_generator(&theta, [1, 1, 16, 32], false);
+            let apart = &sampling_grid - Tensor::affine_grid_generator(&theta, [1, 1, 16, 32], false);
             prop_assert!(apart.abs().max().double_value(&[]) < 1e-4);
-            let (numbers, reached) = read(&map, &sent, &lattice, Order::Planes).unwrap();
-            let (tensors, mask) = read_by_tensors(&map, &sent, &lattice).unwrap();
+            let (numbers, reached) = read(&map, &sent, &sampling_grid, Order::Planes).unwrap();
+            let (tensors, mask) = read_by_tensors(&map, &sent, &sampling_grid).unwrap();
             prop_assert_eq!(numbers.size(), tensors.size());
             // At a position between two cells either may be the nearest.
             let differ = (&reached - mask).abs();

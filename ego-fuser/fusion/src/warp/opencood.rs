@@ -48,12 +48,12 @@ pub fn about_centre(matrix: &Tensor, height: i64, width: i64) -> Result<Tensor, 
 pub fn warp_affine(source: &Tensor, matrix: &Tensor, interpolation: Interpolation) -> Result<Tensor, TchError> {
     let (batch, channels, height, width) = source.size4()?;
     let theta = normalized(matrix, height, width)?;
-    let lattice = Tensor::f_affine_grid_generator(&theta, [batch, channels, height, width], true)?;
+    let sampling_grid = Tensor::f_affine_grid_generator(&theta, [batch, channels, height, width], true)?;
     let mode = match interpolation {
         Interpolation::Bilinear => BILINEAR,
         Interpolation::Nearest => NEAREST,
     };
-    source.f_grid_sampler(&lattice.f_to_kind(source.kind())?, mode, PADDING_ZEROS, true)
+    source.f_grid_sampler(&sampling_grid.f_to_kind(source.kind())?, mode, PADDING_ZEROS, true)
 }
 
 /// Destination-to-source matrices `[N, 2, 3]` on coordinates -1..1 with aligned corners, from source-to-destination

@@ -43,22 +43,29 @@ impl Cells {
         Ok(Self { values: f64_tensor::cells(map)?, channels, height, width })
     }
 
-    /// The map `[C, h, w]` sampled bilinearly at `lattice` `[h, w, 2]` (`grid_sampler`'s coordinates), and its validity
+    /// The map `[C, h, w]` sampled bilinearly at `sampling_grid` `[h, w, 2]` (`grid_sampler`'s coordinates), and its validity
     /// `[1, h, w]` by the nearest cell of `valid` `[H, W]`. Zeros beyond the edges, and where cells are invalid.
-    pub(super) fn read(&self, valid: &Tensor, lattice: &Tensor, order: Order) -> Result<(Tensor, Tensor), TchError> {
-        let (rows, columns, _) = lattice.size3()?;
-        let (valid, lattice) = (numbers(valid)?, numbers(lattice)?);
+    pub(super) fn read(
+        &self,
+        valid: &Tensor,
+        sampling_grid: &Tensor,
+        order: Order,
+    ) -> Result<(Tensor, Tensor), TchError> {
+        let (rows, columns, _) = sampling_grid.size3()?;
+        let (valid, sampling_grid) = (numbers(valid)?, numbers(sampling_grid)?);
         let cells = (rows * columns) as usize;
         let (mut read, mut reached) = (vec![0.0; self.channels * cells], vec![0.0; cells]);
         if order == Order::Cells {
-            let places = lattice.chunks_exact(2).zip(&mut reached).zip(read.chunks_mut(self.channels));
+            let places = sampling_grid.chunks_exact(2).zip(&mut reached).zip(read.chunks_mut(self.channels));
             places.for_each(|((at, reached), values)| *reached = self.read_at([at[0], at[1]], &valid, values));
             let read = Tensor::f_from_slice(&read)?.f_view([rows, columns, -1])?.f_permute([2, 0, 1])?;
             return Ok((read, Tensor::f_from_slice(&reached)?.f_view([1, rows, columns])?));
         }
         let mut block = vec![0.0; BLOCK * self.channels];
-        for (index, (lattice, reached)) in lattice.chunks(2 * BLOCK).zip(reached.chunks_mut(BLOCK)).enumerate() {
-            let places = lattice.chunks_exact(2).zip(reached.iter_mut()).zip(block.chunks_mut(self.channels));
+        for (index, (sampling_grid, reached)) in
+            sampling_grid.chunks(2 * BLOCK).zip(reached.chunks_mut(BLOCK)).enumerate()
+        {
+            let places = sampling_grid.chunks_exact(2).zip(reached.iter_mut()).zip(block.chunks_mut(self.channels));
             places.for_each(|((at, reached), values)| *reached = self.read_at([at[0], at[1]], &valid, values));
             for (channel, plane) in read.chunks_mut(cells).enumerate() {
                 let plane = plane[index * BLOCK..].iter_mut().take(reached.len());
@@ -69,11 +76,15 @@ impl Cells {
         Ok((read, Tensor::f_from_slice(&reached)?.f_view([1, rows, columns])?))
     }
 
-    /// Raises `strongest` `[h * w, C]` to the map's values at `lattice` `[h, w, 2]`, times `shares` `[h, w]`, where
+    /// Raises `strongest` `[h * w, C]` to the map's values at `sampling_grid` `[h, w, 2]`, times `shares` `[h, w]`, where
     /// those are larger, and where the nearest cell of `valid` `[H, W]` is valid.
-    pub(crate) fn raise(&self, strongest: &mut [f32], [valid, lattice, shares]: [&Tensor; 3]) -> Result<(), TchError> {
+    pub(crate) fn raise(
+        &self,
+        strongest: &mut [f32],
+        [valid, sampling_grid, shares]: [&Tensor; 3],
+    ) -> Result<(), TchError> {
         let shares = numbers(shares)?;
-        self.for_each_valid(&numbers(valid)?, &numbers(lattice)?, |cell, shown| {
+        self.for_each_valid(&numbers(valid)?, &numbers(sampling_grid)?, |cell, shown| {
             let strongest = &mut strongest[cell * self.channels..][..self.channels];
             strongest.iter_mut().zip(shown).for_each(|(most, shown)| *most = most.max(shares[cell] * shown));
         });
@@ -85,12 +96,12 @@ impl Cells {
         self.channels
     }
 
-    /// Calls `see` with the features at each position of `lattice` (`grid_sampler`'s coordinates, two per position)
+    /// Calls `see` with the features at each position of `sampling_grid` (`grid_sampler`'s coordinates, two per position)
     /// where the nearest cell of `valid` `[H, W]` is valid.
     #[inline]
-    pub(crate) fn for_each_valid(&self, valid: &[f32], lattice: &[f32], mut see: impl FnMut(usize, &[f32])) {
+    pub(crate) fn for_each_valid(&self, valid: &[f32], sampling_grid: &[f32], mut see: impl FnMut(usize, &[f32])) {
         let mut shown = vec![0.0; self.channels];
-        for (cell, at) in lattice.chunks_exact(2).enumerate() {
+        for (cell, at) in sampling_grid.chunks_exact(2).enumerate() {
             if self.read_at([at[0], at[1]], valid, &mut shown) != 0.0 {
                 see(cell, &shown);
             }

@@ -1,10 +1,10 @@
-//! `ego-fuser residual`: the part of pose offsets that a method's own alignment leaves.
+//! `ego-fuser alignment-error`: the part of pose offsets that a method's own alignment leaves.
 
 use std::path::PathBuf;
 
 use anyhow::Result;
 use dataset::IntensityScale;
-use ego_fuser_offline::alignment_error::{Offset, Residual, ResidualMeter};
+use ego_fuser_offline::alignment_error::{AlignmentError, AlignmentMeter, Offset};
 use perception::weights::Weights;
 use support::output;
 use support::text_table::{Side, TextTable};
@@ -53,7 +53,7 @@ impl Arguments {
         let turns = self.turns.iter().map(|&turn_deg| Offset { shift_m: 0.0, turn_deg });
         let offsets: Vec<Offset> = shifts.chain(turns).collect();
         let weights = Weights::load(&self.weights).map_err(BadInput::of)?;
-        let mut meter = ResidualMeter::load(&weights).map_err(BadInput::of)?;
+        let mut meter = AlignmentMeter::load(&weights).map_err(BadInput::of)?;
         let found = meter.measure(&scenarios(&self.data, self.intensity_scale)?, self.every, &offsets, self.seed)?;
         if self.json {
             output::line(serde_json::to_string_pretty(&found)?)?;
@@ -64,14 +64,14 @@ impl Arguments {
     }
 }
 
-fn table(found: &[Residual]) -> TextTable {
+fn table(found: &[AlignmentError]) -> TextTable {
     let right = ["pairs", "mean m before/after", "median m before/after", "mean degrees before/after"];
     let mut table = TextTable::new([("offset", Side::Left)].into_iter().chain(right.map(|name| (name, Side::Right))));
-    for residual in found {
-        let Offset { shift_m, turn_deg } = residual.offset;
-        let [mean, median, angle] = [residual.mean_m, residual.p50_m, residual.mean_deg]
+    for summary in found {
+        let Offset { shift_m, turn_deg } = summary.offset;
+        let [mean, median, angle] = [summary.mean_m, summary.p50_m, summary.mean_deg]
             .map(|[before, after]| format!("{before:.3} / {after:.3}"));
-        table.row([format!("{shift_m} m {turn_deg} deg"), residual.pairs.to_string(), mean, median, angle]);
+        table.row([format!("{shift_m} m {turn_deg} deg"), summary.pairs.to_string(), mean, median, angle]);
     }
     table
 }

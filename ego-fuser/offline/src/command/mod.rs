@@ -20,7 +20,7 @@ pub(crate) enum Command {
     /// Measure AP on recorded scenes.
     Eval(eval::Arguments),
     /// Measure the part of pose offsets that a method's own alignment leaves.
-    Residual(alignment_error::Arguments),
+    AlignmentError(alignment_error::Arguments),
     /// Train a method on scenes.
     Train(Box<train::Arguments>),
 }
@@ -32,7 +32,7 @@ impl Command {
         match self {
             Self::Align(arguments) => arguments.run()?,
             Self::Eval(arguments) => return arguments.run(),
-            Self::Residual(arguments) => arguments.run()?,
+            Self::AlignmentError(arguments) => arguments.run()?,
             Self::Train(arguments) => arguments.run()?,
         }
         Ok(Outcome::Done)

@@ -115,7 +115,7 @@ pub(crate) struct Arguments {
     /// Train for ego-only operation: samples of one vehicle, with its neighbours' annotations as additional targets
     /// [default for none: its own annotations only].
     #[arg(long)]
-    alone: bool,
+    ego_only: bool,
     /// Steps between two validations and checkpoints.
     #[arg(long, default_value_t = 500)]
     validate_every: u64,
@@ -136,7 +136,7 @@ impl Arguments {
         let config = self.config()?;
         let mut bar = Progress(TrainingBar::of(config.run.length));
         if let Some(hint) = self.hint() {
-            bar.0.say(hint);
+            bar.0.print_line(hint);
         }
         let summary = train::run(&config, &mut bar).map_err(blamed)?;
         bar.0.finish();
@@ -172,7 +172,7 @@ impl Arguments {
             max_agents: self.protocol.max_agents.unwrap_or(5),
             comm_range_m: rule.comm_range_m,
             classes: rule.classes,
-            merged_truth: self.alone,
+            merged_truth: self.ego_only,
             ..SampleConfig::training(SampleKind::Single)
         };
         let unassigned = if self.ignore_unassigned { Unassigned::Ignored } else { Unassigned::Background };
@@ -261,7 +261,7 @@ struct Progress(TrainingBar);
 
 impl Observer for Progress {
     fn opened(&mut self, data: &DataListing) {
-        data.left_out().iter().for_each(|text| self.0.say(text));
+        data.left_out().iter().for_each(|text| self.0.print_line(text));
     }
 
     fn encoded(&mut self, done: usize, all: usize) {
@@ -287,7 +287,7 @@ impl Observer for Progress {
 
     fn validated(&mut self, step: u64, accuracy: &Accuracy) {
         let [ap_30, ap_50, ap_70] = accuracy.ap_global;
-        self.0.say(&format!(
+        self.0.print_line(&format!(
             "step {step}: AP@0.3/0.5/0.7 global {ap_30:.3} {ap_50:.3} {ap_70:.3} on {} frames",
             accuracy.frames
         ));

@@ -28,7 +28,7 @@ impl Participant {
     /// Passes on the last messages of another participant, which an attack may replay.
     pub(super) fn capture(&mut self, latest: Option<&Sent>) {
         if let Some(attack) = &mut self.attack {
-            attack.overhear(latest.map(Sent::captured).unwrap_or_default());
+            attack.capture(latest.map(Sent::captured).unwrap_or_default());
         }
     }
 

@@ -79,7 +79,7 @@ pub struct VehicleConfig {
     /// Its rate control. There is no queue to observe.
     pub rate: RateConfig,
     /// Field that it falsifies; absent: none.
-    pub lie: Option<Falsification>,
+    pub falsification: Option<Falsification>,
 }
 
 /// Runs a scenario; `on_frame` may end it. Each frame's stamp has the time at which the ego published it.

@@ -119,7 +119,7 @@ impl MultiScaleNetwork {
     /// [`TchError`] when the samples do not add up to the sweeps.
     pub fn forward(&self, pillars: &PillarBatch, samples: &[Placement]) -> Result<MultiScaleOutput, TchError> {
         let network = &self.network;
-        let canvas = pillars.scatter(&network.encoder.forward(pillars, false), network.lattice());
+        let canvas = pillars.scatter(&network.encoder.forward(pillars, false), network.pillar_grid());
         let (sent, rate) = match &self.communication {
             Some(communication) => {
                 let alone = network.heads(&network.features_of_canvas(&canvas, false))?;
@@ -141,9 +141,9 @@ impl MultiScaleNetwork {
 
     /// Bytes of the first level's map of each agent.
     fn sent_bytes(&self, sent: Option<&Tensor>, samples: &[Placement]) -> Result<Vec<u64>, TchError> {
-        let (lattice, config) = (self.network.lattice(), &self.network.config);
+        let (pillar_grid, config) = (self.network.pillar_grid(), &self.network.config);
         let stride = config.layer_strides[0];
-        let [height, width] = [lattice.height, lattice.width].map(|extent| extent as u64);
+        let [height, width] = [pillar_grid.height, pillar_grid.width].map(|extent| extent as u64);
         let [height, width] = [height, width].map(|extent| extent.div_ceil(stride.unsigned_abs()));
         let (cells, cell_bytes) = (height * width, 4 * config.num_filters[0].unsigned_abs());
         let agents = samples.iter().map(|sample| sample.agents).sum::<i64>();

@@ -101,7 +101,7 @@ impl OfflineDetector {
 
     fn boxes(&self, sweeps: &[Pillars], poses: &[Pose]) -> Result<(Vec<Detection>, Vec<u64>), ModelError> {
         let network = self.network.network();
-        let batch = PillarBatch::new(&sweeps.iter().collect::<Vec<_>>(), network.lattice());
+        let batch = PillarBatch::new(&sweeps.iter().collect::<Vec<_>>(), network.pillar_grid());
         let mirrored: Vec<Pose> = poses.iter().map(Pose::mirrored_y).collect();
         let poses = if self.is_mirrored() { &mirrored } else { poses };
         let placement = if self.network.config().one_frame {

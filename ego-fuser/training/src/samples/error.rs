@@ -5,7 +5,7 @@ use localization::pose_source::PoseSourceError;
 use tch::TchError;
 
 use crate::feature_store::FeatureStoreError;
-use fusion::targets::LatticeError;
+use fusion::targets::AnchorGridError;
 
 /// Reason why there is no next sample.
 #[derive(Debug, thiserror::Error)]
@@ -40,5 +40,5 @@ pub enum SampleError {
     Torch(#[from] TchError),
     /// The anchors of the configuration are not on a grid.
     #[error(transparent)]
-    Lattice(#[from] LatticeError),
+    AnchorGrid(#[from] AnchorGridError),
 }

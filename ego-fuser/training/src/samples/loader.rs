@@ -1,6 +1,6 @@
 //! Loader: samples in batches, in the order of a training.
 
-use perception::pillars::batch::{PillarBatch, PillarLattice};
+use perception::pillars::batch::{PillarBatch, PillarGrid};
 use perception::train::{Prefetch, RunConfig};
 use rand::SeedableRng;
 use rand::seq::SliceRandom;
@@ -42,7 +42,7 @@ impl Batch {
     ///
     /// # Errors
     /// [`SampleError::Torch`] when maps are of different shapes.
-    pub fn collate(samples: Vec<Sample>, lattice: &PillarLattice) -> Result<Self, SampleError> {
+    pub fn collate(samples: Vec<Sample>, pillar_grid: &PillarGrid) -> Result<Self, SampleError> {
         let (mut pillars, mut maps) = (Vec::new(), Vec::new());
         for sample in &samples {
             match &sample.views {
@@ -51,7 +51,7 @@ impl Batch {
             }
         }
         let views = if maps.is_empty() {
-            BatchViews::Pillars(PillarBatch::new(&pillars, lattice))
+            BatchViews::Pillars(PillarBatch::new(&pillars, pillar_grid))
         } else {
             BatchViews::Maps(Tensor::f_cat(&maps, 0)?)
         };
@@ -83,7 +83,7 @@ impl Batch {
 #[must_use]
 pub fn batches(
     builder: &SampleBuilder,
-    lattice: PillarLattice,
+    pillar_grid: PillarGrid,
     run: &RunConfig,
     first: u64,
 ) -> Prefetch<Result<Batch, SampleError>> {
@@ -98,7 +98,7 @@ pub fn batches(
             builder.build(order.tick(index), &mut rng)
         };
         let samples: Result<Vec<Sample>, _> = (number * size..(number + 1) * size).map(sample).collect();
-        Batch::collate(samples?, &lattice)
+        Batch::collate(samples?, &pillar_grid)
     })
 }
 

@@ -108,8 +108,8 @@ impl<'a> Training<'a> {
 
     fn run(mut self, observer: &mut dyn Observer) -> Result<Summary, TrainError> {
         observer.opened(&self.scenes.data());
-        let lattice = *self.model.network().lattice();
-        let mut loader = batches(&self.builder, lattice, &self.config.run, self.trainer.steps());
+        let pillar_grid = *self.model.network().pillar_grid();
+        let mut loader = batches(&self.builder, pillar_grid, &self.config.run, self.trainer.steps());
         let mut window = Window::new();
         while self.share_done() < 1.0 {
             let asked = Instant::now();

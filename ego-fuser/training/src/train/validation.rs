@@ -78,7 +78,7 @@ impl Validator {
                     && corners.iter().all(|corner| (limits.z_range_m[0]..=limits.z_range_m[1]).contains(&corner[2]))
             };
             let objects: Vec<_> = sample.objects.iter().filter(inside).copied().collect();
-            let batch = Batch::collate(vec![sample], model.network().lattice())?;
+            let batch = Batch::collate(vec![sample], model.network().pillar_grid())?;
             let output = no_grad(|| batch.output(model, false))?;
             for detections in model.detections(&output.head, &limits)? {
                 scorer.add(&detections, &objects);

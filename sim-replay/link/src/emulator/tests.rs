@@ -7,7 +7,7 @@ use super::*;
 
 const MS: u64 = 1_000_000;
 
-fn packet(from: &str, sequence: u64, bytes: u64, offered_nanos: u64) -> Packet {
+fn packet(from: &str, sequence: u64, bytes: u64, submitted_nanos: u64) -> Packet {
     let cav = |name: &str| CavId::new(name).unwrap();
     Packet {
         id: sequence,
@@ -16,7 +16,7 @@ fn packet(from: &str, sequence: u64, bytes: u64, offered_nanos: u64) -> Packet {
         stream: Stream::Bev,
         sequence,
         bytes,
-        offered_nanos,
+        submitted_nanos,
         distance_m: 30.0,
     }
 }
@@ -31,12 +31,12 @@ fn emulator(config: &LinkConfig) -> LinkEmulator {
 
 fn all(config: &LinkConfig, packets: impl IntoIterator<Item = Packet>) -> Vec<Outcome> {
     let mut emulator = emulator(config);
-    packets.into_iter().for_each(|packet| emulator.offer(packet));
+    packets.into_iter().for_each(|packet| emulator.submit(packet));
     emulator.advance(u64::MAX / 4)
 }
 
 fn times_ms(outcomes: &[Outcome]) -> Vec<(u64, u64, Delivery)> {
-    outcomes.iter().map(|outcome| (outcome.parcel.sequence, outcome.nanos / MS, outcome.fate)).collect()
+    outcomes.iter().map(|outcome| (outcome.packet.sequence, outcome.nanos / MS, outcome.delivery)).collect()
 }
 
 const ARRIVED: Delivery = Delivery::Arrived { is_copy: false, is_repeated: false };
@@ -78,7 +78,7 @@ fn a_full_queue_drops_the_newcomer_or_the_oldest() {
     let head = LinkConfig { queue: QueueConfig { drop: QueueDrop::Head, ..queue }, ..shaped(8.0) };
     let expected = [(1, 3, dropped), (0, 20, ARRIVED), (2, 40, ARRIVED), (3, 60, ARRIVED)];
     assert_eq!(times_ms(&all(&head, packets())), expected);
-    let newest = LinkConfig { queue: QueueConfig { keep_newest: true, ..queue }, ..shaped(8.0) };
+    let newest = LinkConfig { queue: QueueConfig { keep_last: true, ..queue }, ..shaped(8.0) };
     let superseded = Delivery::Dropped(DropReason::Superseded);
     let expected = [(1, 2, superseded), (2, 3, superseded), (0, 20, ARRIVED), (3, 40, ARRIVED)];
     assert_eq!(times_ms(&all(&newest, packets())), expected);
@@ -97,7 +97,7 @@ fn the_long_run_rate_is_the_rate_and_the_burst_comes_once() {
         let span_s = (outcomes[1999].nanos - 1_000 * MS) as f64 * 1e-9;
         let rate = (2000 * bytes - burst_bytes) as f64 * 8e-6 / span_s;
         assert!((rate - rate_mbps).abs() < 0.01 * rate_mbps, "{rate} Mbit/s with a burst of {burst_bytes}");
-        let at_once = outcomes.iter().take_while(|outcome| outcome.nanos == outcome.parcel.offered_nanos).count();
+        let at_once = outcomes.iter().take_while(|outcome| outcome.nanos == outcome.packet.submitted_nanos).count();
         assert_eq!(at_once > 0, burst_bytes > 0);
     }
 }
@@ -116,7 +116,7 @@ fn delays_are_cut_down_to_whole_frames_as_in_opencood() {
     let config = LinkConfig::preset("opencood-real").unwrap();
     let outcomes = all(&config, (0..2000).map(|k| packet("a", k, 132_500, k * 100 * MS)));
     let frames = |count: u64| {
-        let late = |outcome: &&Outcome| outcome.nanos - outcome.parcel.offered_nanos == count * 100 * MS;
+        let late = |outcome: &&Outcome| outcome.nanos - outcome.packet.submitted_nanos == count * 100 * MS;
         outcomes.iter().filter(late).count()
     };
     assert_eq!(frames(0) + frames(1), 2000);
@@ -139,7 +139,7 @@ fn jitter_reorders_unless_order_is_kept() {
     let order = |config: &LinkConfig| -> Vec<u64> {
         all(config, (0..200).map(|k| packet("a", k, 10, k * MS)))
             .iter()
-            .map(|outcome| outcome.parcel.sequence)
+            .map(|outcome| outcome.packet.sequence)
             .collect()
     };
     assert!(!order(&jitter).is_sorted());
@@ -158,13 +158,13 @@ fn a_link_is_independent_of_other_links() {
         ..shaped(27.0)
     };
     let of_a = |outcomes: Vec<Outcome>| -> Vec<Outcome> {
-        outcomes.into_iter().filter(|outcome| outcome.parcel.from.as_str() == "a").collect()
+        outcomes.into_iter().filter(|outcome| outcome.packet.from.as_str() == "a").collect()
     };
     let single = of_a(all(&config, (0..300).map(|k| packet("a", k, 40_000, k * 10 * MS))));
     let together = (0..300).flat_map(|k| ["b", "a", "c"].map(|from| packet(from, k, 40_000, k * 10 * MS)));
     assert_eq!(of_a(all(&config, together)), single);
     let other_seed = LinkEmulator::new(config, Path::new("."), 6).map(|mut emulator| {
-        (0..300).for_each(|k| emulator.offer(packet("a", k, 40_000, k * 10 * MS)));
+        (0..300).for_each(|k| emulator.submit(packet("a", k, 40_000, k * 10 * MS)));
         emulator.advance(u64::MAX / 4)
     });
     assert_ne!(other_seed.unwrap(), single);
@@ -175,27 +175,27 @@ proptest! {
     #[test]
     fn every_packet_has_one_outcome_and_steps_change_nothing(
         sizes in prop::collection::vec((1_u64..80_000, 0_u64..30), 1..60), bytes in 1_u64..200_000, drop_head in any::<bool>(),
-        keep_newest in any::<bool>(), shared in any::<bool>(), steps in prop::collection::vec(0_u64..4_000, 0..20),
+        keep_last in any::<bool>(), shared in any::<bool>(), steps in prop::collection::vec(0_u64..4_000, 0..20),
     ) {
         let drop = if drop_head { QueueDrop::Head } else { QueueDrop::Tail };
         let config = LinkConfig {
             medium: if shared { Medium::Shared } else { Medium::PerPair },
-            queue: QueueConfig { bytes, drop, keep_newest, ..QueueConfig::default() },
+            queue: QueueConfig { bytes, drop, keep_last, ..QueueConfig::default() },
             delay: DelayModel::UniformMs([1.0, 60.0]),
             loss: LossModel::Bernoulli(0.1),
             duplicate: 0.1,
             ..shaped(6.0)
         };
-        let mut offered_nanos = 0;
+        let mut submitted_nanos = 0;
         let packets: Vec<Packet> = sizes.iter().enumerate().map(|(k, &(bytes, gap_ms))| {
-            offered_nanos += gap_ms * MS;
-            packet(if k % 3 == 0 { "b" } else { "a" }, k as u64, bytes, offered_nanos)
+            submitted_nanos += gap_ms * MS;
+            packet(if k % 3 == 0 { "b" } else { "a" }, k as u64, bytes, submitted_nanos)
         }).collect();
         let outcomes = all(&config, packets.clone());
         prop_assert!(outcomes.is_sorted_by_key(|outcome| outcome.nanos));
-        prop_assert!(outcomes.iter().all(|outcome| outcome.nanos >= outcome.parcel.offered_nanos));
-        let first = outcomes.iter().filter(|outcome| !matches!(outcome.fate, Delivery::Arrived { is_copy: true, .. }));
-        let first: Vec<u64> = first.map(|outcome| outcome.parcel.sequence).collect();
+        prop_assert!(outcomes.iter().all(|outcome| outcome.nanos >= outcome.packet.submitted_nanos));
+        let first = outcomes.iter().filter(|outcome| !matches!(outcome.delivery, Delivery::Arrived { is_copy: true, .. }));
+        let first: Vec<u64> = first.map(|outcome| outcome.packet.sequence).collect();
         let unique: BTreeSet<u64> = first.iter().copied().collect();
         prop_assert_eq!((first.len(), unique.len()), (packets.len(), packets.len()));
 
@@ -206,8 +206,8 @@ proptest! {
         let mut stepped = Vec::new();
         let mut packets = packets.into_iter().peekable();
         for step in steps.into_iter().chain([u64::MAX / 4]) {
-            while let Some(packet) = packets.next_if(|packet| packet.offered_nanos <= step) {
-                emulator.offer(packet);
+            while let Some(packet) = packets.next_if(|packet| packet.submitted_nanos <= step) {
+                emulator.submit(packet);
             }
             stepped.extend(emulator.advance(step));
         }

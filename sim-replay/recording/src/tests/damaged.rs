@@ -178,11 +178,11 @@ proptest! {
     }
 
     #[test]
-    fn one_bit_costs_one_chunk_at_most_and_is_noticed(at in 0.0_f64..1.0, bit in 0_u8..8, packing in 0..3) {
-        let zstd_level = (packing == 1).then_some(1);
+    fn one_bit_costs_one_chunk_at_most_and_is_noticed(at in 0.0_f64..1.0, bit in 0_u8..8, compression in 0..3) {
+        let zstd_level = (compression == 1).then_some(1);
         let mut bytes = recorded(4, 40, RecordingOptions { zstd_level, ..RecordingOptions::default() });
         let folder = tempfile::tempdir().unwrap();
-        if packing == 2 {
+        if compression == 2 {
             bytes = rewritten(&Recording::open(&write(folder.path(), &bytes)).unwrap(), lz4());
         }
         let at = (at * bytes.len() as f64) as usize;

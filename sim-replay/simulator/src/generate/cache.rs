@@ -10,7 +10,7 @@ use super::error::SynthError;
 use super::layout::SceneLayout;
 use super::options::SynthOptions;
 use super::scenes::{Summary, generate, sources};
-use crate::map::TownSource;
+use crate::map::RoadMapSource;
 use support::bounded_file;
 
 /// Longer files were not written by this program, bytes.
@@ -26,8 +26,8 @@ struct MadeWith {
 struct Generator {
     subset: String,
     seed: u64,
-    town: String,
-    town_seed: u64,
+    map_model: String,
+    map_seed: u64,
     agents: usize,
     frames: usize,
     period_seconds: f64,
@@ -55,23 +55,23 @@ pub fn are_kept(options: &SynthOptions) -> Result<bool, SynthError> {
         let folder = folder.to_owned();
         Err(SynthError::Kept { folder, setting, found, wanted })
     };
-    let towns: Vec<String> = sources(options).iter().map(TownSource::name).collect();
+    let towns: Vec<String> = sources(options).iter().map(RoadMapSource::name).collect();
     for made in &scenarios {
-        let Generator { subset, seed, town, town_seed, agents, frames, period_seconds, weather, layout } = made;
+        let Generator { subset, seed, map_model, map_seed, agents, frames, period_seconds, weather, layout } = made;
         let settings = [
             ("subset", subset.clone(), options.subset.name().to_owned()),
             ("seed", seed.to_string(), options.seed.to_string()),
             ("frames", frames.to_string(), options.frames.to_string()),
             ("period_seconds", period_seconds.to_string(), options.period_s.to_string()),
             ("weather", weather.clone(), options.weather.name().to_owned()),
-            ("town_seed", town_seed.to_string(), options.town_seed.to_string()),
+            ("map_seed", map_seed.to_string(), options.map_seed.to_string()),
             ("layout", layout.clone(), options.layout.name().to_owned()),
         ];
         if let Some((setting, found, wanted)) = settings.into_iter().find(|(_, found, wanted)| found != wanted) {
             return differs(setting, found, wanted);
         }
-        if !towns.contains(town) {
-            return differs("town", town.clone(), towns.join(" or "));
+        if !towns.contains(map_model) {
+            return differs("town", map_model.clone(), towns.join(" or "));
         }
         if !options.agents.contains(agents) {
             let wanted = format!("{} to {}", options.agents.start(), options.agents.end());
@@ -144,7 +144,7 @@ mod tests {
             (SynthOptions { agents: 3..=4, ..options.clone() }, "agents 2, not 3 to 4"),
             (SynthOptions { scenes: 3, ..options.clone() }, "scenarios 2, not 3"),
             (SynthOptions { weather: Weather::Fog, ..options.clone() }, "weather sunny, not fog"),
-            (SynthOptions { town: Some(TownSource::Town1), ..options.clone() }, "town town4, not town1"),
+            (SynthOptions { map_model: Some(RoadMapSource::Town1), ..options.clone() }, "map_model town4, not town1"),
         ] {
             let problem = are_kept(&asked).unwrap_err().to_string();
             assert!(problem.contains(words) && problem.contains(&*out.to_string_lossy()), "{problem}");

@@ -4,7 +4,7 @@ use super::layout::SceneLayout;
 use super::options::SynthOptions;
 use super::recording::SceneSpec;
 use super::traffic::STEP_S;
-use crate::map::{Finding, Town};
+use crate::map::{Finding, MapModel};
 
 /// Name of the file, in the folder of its scenario.
 pub(super) const FILE_NAME: &str = "data_protocol.yaml";
@@ -29,16 +29,16 @@ world:
 
 /// The text of the file. It holds every setting that determines the bytes of the scenario, and the sensors in the terms
 /// of OpenCDA.
-pub(crate) fn protocol_yaml(options: &SynthOptions, spec: &SceneSpec, town: &Town) -> String {
-    let SynthOptions { subset, seed, town_seed, weather, frames, period_s, .. } = options;
-    let (name, town_name, scene_seed, agents) = (&spec.name, &town.name, spec.seed, spec.agents);
+pub(crate) fn protocol_yaml(options: &SynthOptions, spec: &SceneSpec, map_model: &MapModel) -> String {
+    let SynthOptions { subset, seed, map_seed, weather, frames, period_s, .. } = options;
+    let (name, town_name, scene_seed, agents) = (&spec.name, &map_model.name, spec.seed, spec.agents);
     let (subset, weather, version) = (subset.name(), weather.name(), env!("CARGO_PKG_VERSION"));
     // Without the entry the layout is OPV2V's.
     let layout = match options.layout {
         SceneLayout::Opv2v => String::new(),
         layout => format!("  layout: {}\n", layout.name()),
     };
-    let map = map_yaml(&town.findings);
+    let map = map_yaml(&map_model.findings);
     format!(
         "\
 description: generated scene, no recording
@@ -49,8 +49,8 @@ generator:
   scenario: {name}
   seed: {seed}
   scene_seed: {scene_seed}
-  town: '{town_name}'
-  town_seed: {town_seed}
+  map_model: '{town_name}'
+  map_seed: {map_seed}
   agents: {agents}
   frames: {frames}
   period_seconds: {period_s}

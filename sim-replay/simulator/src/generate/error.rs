@@ -2,14 +2,14 @@
 
 use std::path::PathBuf;
 
-use crate::map::TownError;
+use crate::map::RoadMapError;
 
 /// Reasons why scenes could not be generated.
 #[derive(Debug, thiserror::Error)]
 pub enum SynthError {
     /// The map could not be built.
     #[error(transparent)]
-    Town(#[from] TownError),
+    MapModel(#[from] RoadMapError),
     /// The output folder is not empty.
     #[error("{} is not empty; --force writes into it anyway", .0.display())]
     NotEmpty(PathBuf),
@@ -66,7 +66,7 @@ pub enum SynthError {
     #[error(
         "scene {scenario}: {found} vehicles stay within {range_m} m of the ego, {wanted} are wanted; fewer --agents or --frames help"
     )]
-    Alone {
+    TooFewCompanions {
         /// The scenario.
         scenario: String,
         /// Number of companions found.

@@ -9,7 +9,7 @@ use super::error::SynthError;
 use super::layout::SceneLayout;
 use super::traffic::STEP_S;
 use super::weather::Weather;
-use crate::map::TownSource;
+use crate::map::RoadMapSource;
 
 /// The three subsets of V2VLoc.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, ValueEnum)]
@@ -49,9 +49,9 @@ pub struct SynthOptions {
     /// Layout of the files.
     pub layout: SceneLayout,
     /// The map; by default that of the subset, for V2VDet both in turn.
-    pub town: Option<TownSource>,
+    pub map_model: Option<RoadMapSource>,
     /// Determines all static objects.
-    pub town_seed: u64,
+    pub map_seed: u64,
     /// Traversals of a localization subset: one scenario each.
     pub traversals: usize,
     /// Scenes of V2VDet: one scenario each.
@@ -81,8 +81,8 @@ impl SynthOptions {
             seed,
             out,
             layout: SceneLayout::Opv2v,
-            town: None,
-            town_seed: 0,
+            map_model: None,
+            map_seed: 0,
             traversals: 1,
             scenes: 1,
             agents: 2..=4,

@@ -3,7 +3,7 @@
 use super::raycast::{Placement, wrapped};
 use super::traffic::Rectangle;
 use super::vehicle::Vehicle;
-use crate::map::{LaneIndex, ParkingSpot, Town};
+use crate::map::{LaneIndex, MapModel, ParkingSpot};
 use support::random::SplitMix64;
 
 /// Ids of parked vehicles begin here; the number of the spot is added.
@@ -20,11 +20,11 @@ pub(crate) struct ParkedVehicle {
 }
 
 /// Parks vehicles on the spots of a map; the occupancy differs from seed to seed.
-pub(crate) fn park(town: &Town, lanes: &LaneIndex, seed: u64) -> Vec<ParkedVehicle> {
+pub(crate) fn park(map_model: &MapModel, lanes: &LaneIndex, seed: u64) -> Vec<ParkedVehicle> {
     let mut random = SplitMix64::new(seed);
     let occupancy = random.between(0.3, 0.7);
     let mut parked: Vec<ParkedVehicle> = Vec::new();
-    for (number, spot) in town.parking.iter().enumerate() {
+    for (number, spot) in map_model.parking.iter().enumerate() {
         // Each spot has its own random stream: an added spot does not change the others.
         let mut random = SplitMix64::derived(seed, &[number as u64]);
         if !random.chance(occupancy) {
@@ -36,7 +36,7 @@ pub(crate) fn park(town: &Town, lanes: &LaneIndex, seed: u64) -> Vec<ParkedVehic
         let touches = |other: &ParkedVehicle| {
             rectangle.grown(0.1).overlaps(&Rectangle::new(&other.placement, &other.vehicle.size_m))
         };
-        if stands_on_a_lane(town, lanes, &rectangle) || parked.iter().any(touches) {
+        if stands_on_a_lane(map_model, lanes, &rectangle) || parked.iter().any(touches) {
             continue;
         }
         parked.push(ParkedVehicle { id: FIRST_ID + number as i64, vehicle, placement });
@@ -61,12 +61,12 @@ fn place(spot: &ParkingSpot, vehicle: &Vehicle, random: &mut SplitMix64) -> Plac
     Placement { roll_rad, ..Placement::level(position_m, wrapped(yaw + reversed)) }
 }
 
-fn stands_on_a_lane(town: &Town, lanes: &LaneIndex, rectangle: &Rectangle) -> bool {
+fn stands_on_a_lane(map_model: &MapModel, lanes: &LaneIndex, rectangle: &Rectangle) -> bool {
     let ([x, y], [c, s], [length, width]) = (rectangle.center_m, rectangle.axis, rectangle.half_m);
     let outline = [(-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0), (0.0, -1.0), (0.0, 1.0), (0.0, 0.0)];
     outline.iter().any(|&(along, aside)| {
         let (dx, dy) = (along * length, aside * width);
         let point = [x + dx * c - dy * s, y + dx * s + dy * c];
-        lanes.nearest(&town.lanes, point, LANE_ROOM_M, None, Some(rectangle.z_m)).is_some()
+        lanes.nearest(&map_model.lanes, point, LANE_ROOM_M, None, Some(rectangle.z_m)).is_some()
     })
 }

@@ -74,7 +74,7 @@ impl RecordedFrame {
 
 /// Simulates a scene; tries others of the same seed if too few vehicles stay near the ego.
 pub(crate) fn record(world: &World<'_>, spec: &SceneSpec) -> Result<Recording, SynthError> {
-    let parked = park(world.town, &world.lane_index, derive_seed(spec.seed, &[1]));
+    let parked = park(world.map_model, &world.lane_index, derive_seed(spec.seed, &[1]));
     let mut best: Option<(f64, Recording)> = None;
     for attempt in 0..ATTEMPTS {
         let (vehicles, frames) = simulate(world, spec, &parked, derive_seed(spec.seed, &[2, attempt]))?;
@@ -90,9 +90,9 @@ pub(crate) fn record(world: &World<'_>, spec: &SceneSpec) -> Result<Recording, S
             break;
         }
     }
-    let (_, recording) = best.ok_or_else(|| SynthError::NoRoad(world.town.name.clone()))?;
+    let (_, recording) = best.ok_or_else(|| SynthError::NoRoad(world.map_model.name.clone()))?;
     if recording.agents.len() < spec.agents {
-        return Err(SynthError::Alone {
+        return Err(SynthError::TooFewCompanions {
             scenario: spec.name.clone(),
             found: recording.agents.len() - 1,
             wanted: spec.agents - 1,
@@ -111,7 +111,7 @@ fn simulate(
     let mut random = SplitMix64::new(seed);
     let spawns = &world.roads.spawns;
     if spawns.is_empty() {
-        return Err(SynthError::NoRoad(world.town.name.clone()));
+        return Err(SynthError::NoRoad(world.map_model.name.clone()));
     }
     let footprints: Vec<Rectangle> =
         parked.iter().map(|parked| Rectangle::new(&parked.placement, &parked.vehicle.size_m)).collect();

@@ -16,7 +16,7 @@ use super::recording::{RecordedFrame, Recording, SceneSpec, record};
 use super::sensing::Bench;
 use super::traffic::STEP_S;
 use super::world::World;
-use crate::map::{self, Finding, Town, TownSource};
+use crate::map::{self, Finding, MapModel, RoadMapSource};
 use dataset::frame::Frame;
 use support::random::derive_seed;
 
@@ -63,13 +63,13 @@ pub fn generate(options: &SynthOptions, progress: &(dyn Fn(u64) + Sync)) -> Resu
     let omitted = Omissions::default();
     let mut total = Summary { layout: options.layout, ..Summary::default() };
     for (place, source) in sources(options).iter().enumerate() {
-        let town = map::build(source, options.town_seed)?;
-        total.findings.extend(town.findings.iter().cloned());
-        let world = World::new(&town);
+        let map_model = map::build(source, options.map_seed)?;
+        total.findings.extend(map_model.findings.iter().cloned());
+        let world = World::new(&map_model);
         let places = sources(options).len();
         for number in (place..options.scenarios()).step_by(places) {
             let before = total.scenarios as u64 * 1000;
-            let spec = spec(options, &town, number);
+            let spec = spec(options, &map_model, number);
             let scene = Scene { options, world: &world, spec };
             let progress = |thousandths| progress(before + thousandths);
             total.add(&scene.write(writer.as_mut(), &omitted, &progress)?);
@@ -82,23 +82,23 @@ pub fn generate(options: &SynthOptions, progress: &(dyn Fn(u64) + Sync)) -> Resu
 }
 
 /// The maps of the scenarios, used in turn.
-pub(super) fn sources(options: &SynthOptions) -> Vec<TownSource> {
-    match (&options.town, options.subset) {
-        (Some(town), _) => vec![town.clone()],
-        (None, Subset::Town1loc) => vec![TownSource::Town1],
-        (None, Subset::Town4loc) => vec![TownSource::Town4],
-        (None, Subset::V2vdet) => vec![TownSource::Town1, TownSource::Town4],
+pub(super) fn sources(options: &SynthOptions) -> Vec<RoadMapSource> {
+    match (&options.map_model, options.subset) {
+        (Some(map_model), _) => vec![map_model.clone()],
+        (None, Subset::Town1loc) => vec![RoadMapSource::Town1],
+        (None, Subset::Town4loc) => vec![RoadMapSource::Town4],
+        (None, Subset::V2vdet) => vec![RoadMapSource::Town1, RoadMapSource::Town4],
     }
 }
 
-fn spec(options: &SynthOptions, town: &Town, number: usize) -> SceneSpec {
+fn spec(options: &SynthOptions, map_model: &MapModel, number: usize) -> SceneSpec {
     // Every scene has its own seed, independent of the numbers of scenes and agents before it.
     let seed = derive_seed(options.seed, &[options.subset as u64, number as u64]);
     let (low, high) = (*options.agents.start(), *options.agents.end());
     let is_detection = options.subset == Subset::V2vdet;
     let choice = (derive_seed(seed, &[0]) % (high - low + 1) as u64) as usize;
     SceneSpec {
-        name: format!("{}_{}_s{}_{number:04}", options.subset.name(), town.name.to_lowercase(), options.seed),
+        name: format!("{}_{}_s{}_{number:04}", options.subset.name(), map_model.name.to_lowercase(), options.seed),
         seed,
         agents: if is_detection { low + choice } else { 1 },
         frames: options.frames,
@@ -157,7 +157,7 @@ impl Scene<'_, '_> {
             agents: agents.iter().map(|agent| SceneAgent { id: agent.cav.clone(), is_roadside: false }).collect(),
             capture_nanos: recording.frames.iter().map(capture_nanos).collect(),
             tick_nanos: STEP_NANOS,
-            origin: protocol_yaml(self.options, &self.spec, self.world.town),
+            origin: protocol_yaml(self.options, &self.spec, self.world.map_model),
         }
     }
 

@@ -3,11 +3,11 @@
 use super::raycast::{Body, BodyShape, Bounds, Part, Placement, Plane, Surface, Sweep};
 use super::terrain::{TerrainSurface, deck_shape};
 use super::traffic::Roads;
-use crate::map::{LaneIndex, Shape, Solid, Terrain, Town};
+use crate::map::{LaneIndex, MapModel, Shape, Solid, Terrain};
 
 /// A map prepared for ray casting and driving.
 pub(crate) struct World<'t> {
-    pub(crate) town: &'t Town,
+    pub(crate) map_model: &'t MapModel,
     pub(crate) roads: Roads<'t>,
     pub(crate) lane_index: LaneIndex,
     ground: Box<dyn Surface + Send + Sync>,
@@ -23,18 +23,18 @@ struct Standing {
 }
 
 impl<'t> World<'t> {
-    pub(crate) fn new(town: &'t Town) -> Self {
-        let decks = town.ground.decks.iter().filter_map(deck_shape).map(|(shape, center_m)| Standing {
+    pub(crate) fn new(map_model: &'t MapModel) -> Self {
+        let decks = map_model.ground.decks.iter().filter_map(deck_shape).map(|(shape, center_m)| Standing {
             radius_m: shape.bounds.radius_m(),
             shape,
             placement: Placement::level(center_m, 0.0),
         });
         Self {
-            town,
-            roads: Roads::new(&town.lanes),
-            lane_index: LaneIndex::new(&town.lanes),
-            ground: ground_surface(town),
-            standing: town.solids.iter().map(Standing::from).chain(decks).collect(),
+            map_model,
+            roads: Roads::new(&map_model.lanes),
+            lane_index: LaneIndex::new(&map_model.lanes),
+            ground: ground_surface(map_model),
+            standing: map_model.solids.iter().map(Standing::from).chain(decks).collect(),
         }
     }
 
@@ -55,8 +55,8 @@ impl<'t> World<'t> {
 
 /// The ground of a map, without its decks, as a surface for ray casting.
 #[must_use]
-pub fn ground_surface(town: &Town) -> Box<dyn Surface + Send + Sync> {
-    match &town.ground.terrain {
+pub fn ground_surface(map_model: &MapModel) -> Box<dyn Surface + Send + Sync> {
+    match &map_model.ground.terrain {
         Terrain::Plane { z_m } => Box::new(Plane(*z_m)),
         Terrain::Grid(grid) => Box::new(TerrainSurface::new(grid)),
     }

@@ -1,7 +1,7 @@
 //! Clearance check: finds solids that reach into the space of a lane.
 
 use super::convex::{CellIndex, Rectangle, bounds, overlap};
-use super::{LaneId, Shape, Solid, Town};
+use super::{LaneId, MapModel, Shape, Solid};
 
 /// Height over a lane that stays free of solids, metres.
 pub const LANE_HEADROOM_M: f64 = 4.5;
@@ -18,8 +18,8 @@ pub(crate) fn outline(solid: &Solid) -> Rectangle {
     Rectangle { center_m: [solid.center_m[0], solid.center_m[1]], half_m, yaw_rad }
 }
 
-impl Town {
-    /// Lanes and solids (by index in [`Town::solids`]) where the solid reaches into the lane's space up to
+impl MapModel {
+    /// Lanes and solids (by index in [`MapModel::solids`]) where the solid reaches into the lane's space up to
     /// [`LANE_HEADROOM_M`] over it. Empty for a valid map.
     #[must_use]
     pub fn obstructions(&self) -> Vec<(LaneId, usize)> {
@@ -70,7 +70,7 @@ mod tests {
         let solid = |y: f64, z: f64| Solid::new(SolidKind::Sign, shape, [10.0, y, z], 0.3, 0.5);
         let solids = vec![solid(0.0, 5.6), solid(1.5, 1.0), solid(2.5, 1.0), solid(0.0, -0.6)];
         let ground = Ground::plane(0.0);
-        let town = Town { name: "line".into(), lanes, ground, solids, parking: vec![], findings: vec![] };
-        assert_eq!(town.obstructions(), [(LaneId(0), 1)]);
+        let map_model = MapModel { name: "line".into(), lanes, ground, solids, parking: vec![], findings: vec![] };
+        assert_eq!(map_model.obstructions(), [(LaneId(0), 1)]);
     }
 }

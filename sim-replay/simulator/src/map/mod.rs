@@ -1,6 +1,6 @@
 //! Static scene: roads, ground, buildings and street furniture.
 //!
-//! A [`Town`] is made from a source (one of two procedural kinds, or an OpenDRIVE map) and a seed; the same source and
+//! A [`MapModel`] is made from a source (one of two procedural kinds, or an OpenDRIVE map) and a seed; the same source and
 //! seed give the same result, byte for byte. Routes, traffic and parked cars are generated later from another seed.
 //!
 //! # Frames and units
@@ -48,7 +48,7 @@ const MAX_EXTENT_M: f64 = 50_000.0;
 
 /// All static parts of a scene.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Town {
+pub struct MapModel {
     /// Kind of procedural map, such as `town1`, or the stem of the map's file.
     pub name: String,
     /// Driving lanes.
@@ -65,7 +65,7 @@ pub struct Town {
 
 /// Source of a map.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum TownSource {
+pub enum RoadMapSource {
     /// A small town with T-junctions and crossings.
     Town1,
     /// A motorway ring with ramps, an interchange, an under-pass, roundabouts and a small town.
@@ -74,7 +74,7 @@ pub enum TownSource {
     OpenDrive(PathBuf),
 }
 
-impl TownSource {
+impl RoadMapSource {
     /// The name of the map made from it: its kind, or the stem of the map's file in small letters.
     #[must_use]
     pub fn name(&self) -> String {
@@ -104,7 +104,7 @@ pub struct ParkingSpot {
 
 /// Reasons why a map cannot be built.
 #[derive(Debug, thiserror::Error)]
-pub enum TownError {
+pub enum RoadMapError {
     /// The map's file could not be read.
     #[error("{}: {source}", path.display())]
     Read {
@@ -141,36 +141,36 @@ pub enum TownError {
     },
 }
 
-/// Builds the map of `source` and `town_seed`.
+/// Builds the map of `source` and `map_seed`.
 ///
 /// # Errors
-/// [`TownError`] when a map cannot be read or is no usable road network; procedural maps always build.
-pub fn build(source: &TownSource, town_seed: u64) -> Result<Town, TownError> {
+/// [`RoadMapError`] when a map cannot be read or is no usable road network; procedural maps always build.
+pub fn build(source: &RoadMapSource, map_seed: u64) -> Result<MapModel, RoadMapError> {
     let name = source.name();
     match source {
-        TownSource::Town1 => Ok(place_roadside(name, &layout::town1(town_seed), town_seed)),
-        TownSource::Town4 => Ok(place_roadside(name, &layout::town4(town_seed), town_seed)),
-        TownSource::OpenDrive(path) => {
+        RoadMapSource::Town1 => Ok(place_roadside(name, &layout::town1(map_seed), map_seed)),
+        RoadMapSource::Town4 => Ok(place_roadside(name, &layout::town4(map_seed), map_seed)),
+        RoadMapSource::OpenDrive(path) => {
             let Map { network, lanes } = read_map(path)?;
             check_extent(path, &network, &lanes)?;
-            Ok(place_roadside(name, &Layout { network, islands: Vec::new() }, town_seed))
+            Ok(place_roadside(name, &Layout { network, islands: Vec::new() }, map_seed))
         }
     }
 }
 
 /// Refuses maps without driving lanes, and maps so large that the ground between their roads would not fit in memory.
-fn check_extent(path: &Path, network: &RoadNetwork, graph: &LaneGraph) -> Result<(), TownError> {
+fn check_extent(path: &Path, network: &RoadNetwork, graph: &LaneGraph) -> Result<(), RoadMapError> {
     let points = || graph.lanes.iter().flat_map(|lane| &lane.centerline);
     let extent = |axis: usize| {
         let values = || points().map(|point| point[axis]);
         values().fold(f64::NEG_INFINITY, f64::max) - values().fold(f64::INFINITY, f64::min)
     };
     if graph.lanes.is_empty() {
-        return Err(TownError::NoLanes { path: path.into(), roads: network.roads.len() });
+        return Err(RoadMapError::NoLanes { path: path.into(), roads: network.roads.len() });
     }
     let extent_m = extent(0).max(extent(1));
     if extent_m > MAX_EXTENT_M {
-        return Err(TownError::TooLarge { path: path.into(), extent_m, limit_m: MAX_EXTENT_M });
+        return Err(RoadMapError::TooLarge { path: path.into(), extent_m, limit_m: MAX_EXTENT_M });
     }
     Ok(())
 }
@@ -187,23 +187,23 @@ pub struct Map {
 /// Reads the file of an OpenDRIVE map.
 ///
 /// # Errors
-/// [`TownError::Read`] and [`TownError::OpenDrive`].
-pub fn read_map(path: &Path) -> Result<Map, TownError> {
+/// [`RoadMapError::Read`] and [`RoadMapError::OpenDrive`].
+pub fn read_map(path: &Path) -> Result<Map, RoadMapError> {
     let bytes = bounded_file::read(path, opendrive::MAX_BYTES as u64);
-    let bytes = bytes.map_err(|source| TownError::Read { path: path.into(), source })?;
+    let bytes = bytes.map_err(|source| RoadMapError::Read { path: path.into(), source })?;
     let network = opendrive::read_bytes(&bytes);
-    let mut network = network.map_err(|source| TownError::OpenDrive { path: path.into(), source })?;
+    let mut network = network.map_err(|source| RoadMapError::OpenDrive { path: path.into(), source })?;
     let (lanes, counts) = lane_builder::lane_graph(&network);
     network.findings.extend(counts.findings);
     Ok(Map { network, lanes })
 }
 
-fn place_roadside(name: String, layout: &Layout, town_seed: u64) -> Town {
+fn place_roadside(name: String, layout: &Layout, map_seed: u64) -> MapModel {
     let (lanes, _) = lane_builder::lane_graph(&layout.network);
     let surface = Surface::new(&layout.network);
-    let ground = terrain::ground(&surface, town_seed);
-    let (solids, parking) = roadside::place_roadside(layout, &surface, &ground, town_seed);
-    Town { name, lanes, ground, solids, parking, findings: layout.network.findings.clone() }
+    let ground = terrain::ground(&surface, map_seed);
+    let (solids, parking) = roadside::place_roadside(layout, &surface, &ground, map_seed);
+    MapModel { name, lanes, ground, solids, parking, findings: layout.network.findings.clone() }
 }
 
 #[cfg(test)]
@@ -212,7 +212,7 @@ mod tests {
 
     #[test]
     fn same_seed_same_town_on_any_thread() {
-        for source in [TownSource::Town1, TownSource::Town4] {
+        for source in [RoadMapSource::Town1, RoadMapSource::Town4] {
             let elsewhere = {
                 let source = source.clone();
                 std::thread::spawn(move || build(&source, 11).unwrap())
@@ -228,30 +228,37 @@ mod tests {
     #[test]
     fn procedural_maps_are_unchanged() {
         for (source, counts, sums) in [
-            (TownSource::Town1, [168, 4221, 445, 0], [4735203.0653, 2410977.6519, 244239.8916]),
-            (TownSource::Town4, [172, 11365, 286, 192], [2554837.7919, 1465742.7106, 139175.4820]),
+            (RoadMapSource::Town1, [168, 4221, 445, 0], [4735203.0653, 2410977.6519, 244239.8916]),
+            (RoadMapSource::Town4, [172, 11365, 286, 192], [2554837.7919, 1465742.7106, 139175.4820]),
         ] {
-            let town = build(&source, 0).unwrap();
+            let map_model = build(&source, 0).unwrap();
             let sum = |values: &mut dyn Iterator<Item = [f64; 3]>| -> f64 {
                 values.map(|[x, y, z]| x + 2.0 * y + 3.0 * z).sum()
             };
             let found = [
-                sum(&mut town.lanes.lanes.iter().flat_map(|lane| &lane.centerline).copied()),
-                sum(&mut town.solids.iter().map(|solid| solid.center_m)),
-                sum(&mut town.parking.iter().map(|spot| [spot.center_m[0], spot.center_m[1], spot.yaw_rad])),
+                sum(&mut map_model.lanes.lanes.iter().flat_map(|lane| &lane.centerline).copied()),
+                sum(&mut map_model.solids.iter().map(|solid| solid.center_m)),
+                sum(&mut map_model.parking.iter().map(|spot| [spot.center_m[0], spot.center_m[1], spot.yaw_rad])),
             ];
-            let counted = [town.lanes.lanes.len(), town.solids.len(), town.parking.len(), town.ground.decks.len()];
+            let counted = [
+                map_model.lanes.lanes.len(),
+                map_model.solids.len(),
+                map_model.parking.len(),
+                map_model.ground.decks.len(),
+            ];
             assert_eq!(counted, counts, "{source:?}");
             assert!(found.iter().zip(sums).all(|(found, sum): (&f64, f64)| (found - sum).abs() < 0.01), "{found:?}");
-            assert!(town.findings.is_empty() && town.lanes.lanes.iter().all(|lane| lane.banks_rad.is_empty()));
+            assert!(
+                map_model.findings.is_empty() && map_model.lanes.lanes.iter().all(|lane| lane.banks_rad.is_empty())
+            );
         }
     }
 
     #[test]
     fn unusable_maps_are_refused_with_their_path() {
         let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("town.xodr");
-        let error = || build(&TownSource::OpenDrive(path.clone()), 0).unwrap_err().to_string();
+        let path = folder.path().join("map_model.xodr");
+        let error = || build(&RoadMapSource::OpenDrive(path.clone()), 0).unwrap_err().to_string();
         assert!(error().starts_with(&path.display().to_string()), "{}", error());
         std::fs::write(&path, "<OpenDRIVE><road id=\"1\" length=\"x\"/></OpenDRIVE>").unwrap();
         assert!(error().ends_with("line 1: <road> has no <planView>"), "{}", error());
@@ -270,8 +277,8 @@ mod tests {
         std::fs::write(&path, road(lane, 60_000)).unwrap();
         assert!(error().ends_with("its lanes reach over 60000 m, more than the limit of 50000 m"), "{}", error());
         std::fs::write(&path, road(lane, 400)).unwrap();
-        let town = build(&TownSource::OpenDrive(path.clone()), 0).unwrap();
-        assert_eq!((town.name.as_str(), town.lanes.lanes.len()), ("town", 1));
-        assert!(town.obstructions().is_empty() && town.solids.len() > 50);
+        let map_model = build(&RoadMapSource::OpenDrive(path.clone()), 0).unwrap();
+        assert_eq!((map_model.name.as_str(), map_model.lanes.lanes.len()), ("town", 1));
+        assert!(map_model.obstructions().is_empty() && map_model.solids.len() > 50);
     }
 }

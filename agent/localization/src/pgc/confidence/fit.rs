@@ -38,9 +38,9 @@ pub struct FitReport {
     /// Number of these with an error above 3 m.
     pub bad: usize,
     /// Number of bad poses that are rejected.
-    pub bad_withheld: usize,
+    pub bad_rejected: usize,
     /// Number of good poses that are rejected.
-    pub good_withheld: usize,
+    pub good_rejected: usize,
 }
 
 /// Error of a fit.
@@ -76,19 +76,19 @@ impl ConfidenceModel {
         let rows: Vec<[f64; FEATURES]> = sweeps.iter().map(|sweep| features(&sweep.evidence)).collect();
         let targets: Vec<f64> = sweeps.iter().map(|sweep| sweep.error_m.max(SMALLEST_ERROR_M).ln()).collect();
         let (bias, weights) = non_negative_regression(&rows, &targets);
-        let mut model = Self { bias, weights, sigma: MonotoneMap::falling(Vec::new()), withhold_below: 0.0 };
+        let mut model = Self { bias, weights, sigma: MonotoneMap::falling(Vec::new()), reject_below: 0.0 };
         let samples = sweeps.iter().map(|sweep| (model.log_error(&sweep.evidence), observed(sweep.error_m)));
         model.sigma = MonotoneMap::fit(samples.collect(), GROUPS.0, GROUPS.1);
 
         let sigmas: Vec<(f64, bool)> =
             sweeps.iter().map(|sweep| (model.sigma(&sweep.evidence), sweep.error_m <= BAD_M)).collect();
-        model.withhold_below = threshold(&sigmas, good_loss);
+        model.reject_below = threshold(&sigmas, good_loss);
         let count = |is_counted: &dyn Fn(&(f64, bool)) -> bool| sigmas.iter().filter(|sigma| is_counted(sigma)).count();
         let report = FitReport {
             sweeps: sweeps.len(),
             bad: count(&|(_, is_good)| !is_good),
-            bad_withheld: count(&|(sigma, is_good)| !is_good && *sigma < model.withhold_below),
-            good_withheld: count(&|(sigma, is_good)| *is_good && *sigma < model.withhold_below),
+            bad_rejected: count(&|(sigma, is_good)| !is_good && *sigma < model.reject_below),
+            good_rejected: count(&|(sigma, is_good)| *is_good && *sigma < model.reject_below),
         };
         Ok((model, report))
     }
@@ -164,7 +164,7 @@ mod tests {
     #[test]
     fn a_fitted_confidence_ranks_and_is_calibrated_on_other_sweeps() {
         let (model, report) = ConfidenceModel::fit(&sweeps(0..600), 0.01).unwrap();
-        assert!(report.bad > 5 && report.bad_withheld * 2 >= report.bad, "{report:?}");
+        assert!(report.bad > 5 && report.bad_rejected * 2 >= report.bad, "{report:?}");
         assert!(model.weights.iter().all(|&weight| weight >= 0.0));
         let others = sweeps(5000..5600);
         let sigmas: Vec<f64> = others.iter().map(|sweep| model.sigma(&sweep.evidence)).collect();
@@ -175,7 +175,7 @@ mod tests {
         let gap = mean(&mut sigmas.iter().copied()) - mean(&mut errors.iter().map(|&error| observed(error)));
         assert!(gap.abs() < 0.05, "{gap}");
         let good = others.iter().filter(|sweep| sweep.error_m <= BAD_M);
-        let lost = good.clone().filter(|sweep| model.sigma(&sweep.evidence) < model.withhold_below).count();
+        let lost = good.clone().filter(|sweep| model.sigma(&sweep.evidence) < model.reject_below).count();
         assert!((lost as f64) < 0.02 * good.count() as f64, "{lost}");
     }
 

@@ -45,10 +45,10 @@ impl Confidence {
 
     /// True if a pose of this sigma is rejected.
     #[must_use]
-    pub fn withholds(&self, sigma: f64) -> bool {
+    pub fn rejects(&self, sigma: f64) -> bool {
         match self {
             Self::Plain => false,
-            Self::Calibrated(model) => sigma < model.withhold_below,
+            Self::Calibrated(model) => sigma < model.reject_below,
         }
     }
 }
@@ -65,7 +65,7 @@ pub struct ConfidenceModel {
     /// Decreasing function from the expected logarithm of the error to sigma.
     pub sigma: MonotoneMap,
     /// Threshold: poses of a lower sigma are rejected.
-    pub withhold_below: f64,
+    pub reject_below: f64,
 }
 
 impl ConfidenceModel {
@@ -80,8 +80,8 @@ impl ConfidenceModel {
         if let Some(weight) = self.weights.iter().find(|weight| !(0.0..=MAX_WEIGHT).contains(*weight)) {
             return Err(format!("a weight is {weight:?}, must be 0 to 1e9"));
         }
-        if !(0.0..=1.0).contains(&self.withhold_below) {
-            return Err(format!("withhold_below is {}, must be 0 to 1", self.withhold_below));
+        if !(0.0..=1.0).contains(&self.reject_below) {
+            return Err(format!("reject_below is {}, must be 0 to 1", self.reject_below));
         }
         self.sigma.check()
     }
@@ -101,7 +101,7 @@ impl ConfidenceModel {
     #[must_use]
     pub fn example() -> Self {
         let sigma = MonotoneMap::falling(vec![(-3.0, 0.95), (0.0, 0.5), (2.0, 0.05)]);
-        Self { bias: -1.0, weights: [0.3; FEATURES], sigma, withhold_below: 0.1 }
+        Self { bias: -1.0, weights: [0.3; FEATURES], sigma, reject_below: 0.1 }
     }
 }
 
@@ -165,7 +165,7 @@ mod tests {
         weights[3] = -0.1;
         assert!(refused(ConfidenceModel { weights, ..example() }, "-0.1"));
         assert!(refused(ConfidenceModel { bias: f64::NAN, ..example() }, "bias is NaN"));
-        assert!(refused(ConfidenceModel { withhold_below: 1.5, ..example() }, "withhold_below is 1.5"));
+        assert!(refused(ConfidenceModel { reject_below: 1.5, ..example() }, "reject_below is 1.5"));
         for knots in [vec![(1.0, 0.5), (0.0, 0.4)], vec![(0.0, 0.4), (1.0, 0.5)], vec![(0.0, 2.0)]] {
             assert!(refused(ConfidenceModel { sigma: MonotoneMap::falling(knots), ..example() }, "sigma has"));
         }
@@ -173,7 +173,7 @@ mod tests {
 
     #[test]
     fn the_plain_confidence_rejects_nothing() {
-        assert!(!Confidence::Plain.withholds(0.0));
-        assert!(Confidence::Calibrated(ConfidenceModel::example()).withholds(0.09));
+        assert!(!Confidence::Plain.rejects(0.0));
+        assert!(Confidence::Calibrated(ConfidenceModel::example()).rejects(0.09));
     }
 }

@@ -58,7 +58,7 @@ fn tell(bar: &TrainingBar, report: &EncoderReport) {
             bar.report(*share_done, *seconds, &text);
         }
         EncoderReport::Validated(step, EncoderAccuracy { top1, offset_m }) => {
-            bar.say(&format!("step {step}: validation top-1 {:.1} % offset {offset_m:.2} m", 100.0 * top1));
+            bar.print_line(&format!("step {step}: validation top-1 {:.1} % offset {offset_m:.2} m", 100.0 * top1));
         }
     }
 }

@@ -20,7 +20,7 @@ pub(crate) struct Args {
     regresses: Regresses,
     /// Name of the scene, for messages and the model card.
     #[arg(long, default_value = "town")]
-    town: String,
+    scene_name: String,
     /// Weights of a frozen encoder [default: the encoder is trained from random weights with the rest].
     #[arg(long, value_name = "FILE")]
     encoder: Option<PathBuf>,
@@ -50,7 +50,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
             Regresses::SceneCoordinates => EndToEndKind::SceneCoordinates,
             Regresses::Pose => EndToEndKind::Pose,
         },
-        town: args.town.clone(),
+        scene_name: args.scene_name.clone(),
         encoder: match &args.encoder {
             Some(path) => EncoderStart::Frozen(path.clone()),
             None => EncoderStart::Untrained(SceneEncoderConfig::lean()),
@@ -66,7 +66,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     })?;
     bar.finish();
     print_left_out(&bar, &trained.data);
-    let title = format!("End-to-end regressor of {}: {:?}", config.town, config.regresses);
+    let title = format!("End-to-end regressor of {}: {:?}", config.scene_name, config.regresses);
     let how = match args.encoder {
         Some(_) => "Last layers on the features of a frozen encoder, trained on the sweeps of one scene.",
         None => "Trained from random weights on the sweeps of one scene.",

@@ -27,5 +27,5 @@ pub(crate) fn check_folders<'a>(folders: impl IntoIterator<Item = &'a PathBuf>) 
 
 /// Prints the part of the data that cannot be used.
 pub(crate) fn print_left_out(bar: &TrainingBar, data: &DataListing) {
-    data.left_out().iter().for_each(|text| bar.say(text));
+    data.left_out().iter().for_each(|text| bar.print_line(text));
 }

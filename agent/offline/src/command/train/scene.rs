@@ -31,7 +31,7 @@ pub(crate) struct Args {
     encoder: PathBuf,
     /// Name of the scene, for messages and the model card.
     #[arg(long, default_value = "town")]
-    town: String,
+    scene_name: String,
     /// Clusters of sensor positions that a sweep is classified into.
     #[arg(long, default_value_t = 50)]
     classes: i64,
@@ -84,7 +84,7 @@ fn tell(bar: &TrainingBar, report: &SceneReport) {
         SceneReport::Encoding(done, total) => bar.encoded(*done, *total),
         SceneReport::Encoded(data) => print_left_out(bar, data),
         SceneReport::Classified(share) => {
-            bar.say(&format!("{:.1} % of the training sweeps are assigned to their cluster", 100.0 * share));
+            bar.print_line(&format!("{:.1} % of the training sweeps are assigned to their cluster", 100.0 * share));
         }
         SceneReport::Stepped { step, epoch, share_done, seconds, error_m, epsilon_m, refined_m } => {
             let text = format!(
@@ -92,7 +92,7 @@ fn tell(bar: &TrainingBar, report: &SceneReport) {
             );
             bar.report(*share_done, *seconds, &text);
         }
-        SceneReport::Validated(seconds, accuracy) => bar.say(&format!(
+        SceneReport::Validated(seconds, accuracy) => bar.print_line(&format!(
             "{seconds:.0} s: cells {:.2} m, poses {:.3} m {:.3} degrees, under 3 m {:.1} %, under 1 m {:.1} %",
             accuracy.cell_p50_m,
             accuracy.pose_p50_m,
@@ -114,7 +114,7 @@ impl Args {
             validation: self.validation.clone(),
             validation_sweeps: self.validation_sweeps,
             encoder: self.encoder.clone(),
-            town: self.town.clone(),
+            scene_name: self.scene_name.clone(),
             classes: self.classes,
             centres: self.centres,
             width: self.width,
@@ -129,7 +129,7 @@ impl Args {
 }
 
 fn card(config: &SceneTrainConfig, summary: &SceneSummary) -> ModelCard {
-    let title = format!("Scene head of {}", config.town);
+    let title = format!("Scene head of {}", config.scene_name);
     let mut card = ModelCard::new(&title, "World coordinates of cells on the features of a frozen encoder.");
     card.trained(&config.run, &summary.trained, &format!("{} sweeps", summary.sweeps), "cells");
     card.row("of which reading and encoding", format_args!("{:.0} s", summary.preparing_seconds));

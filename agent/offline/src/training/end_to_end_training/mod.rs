@@ -37,7 +37,7 @@ pub struct EndToEndTrainConfig {
     /// Target of the regression.
     pub regresses: EndToEndKind,
     /// Name of the scene.
-    pub town: String,
+    pub scene_name: String,
     /// Origin of the encoder's weights.
     pub encoder: EncoderStart,
     /// Training run; a batch are sweeps.
@@ -107,7 +107,7 @@ pub fn train_end_to_end(
     };
     let network_config = EndToEndConfig {
         regresses: config.regresses,
-        town: config.town.clone(),
+        scene_name: config.scene_name.clone(),
         origin_m: examples.origin_m(),
         encoder,
     };

@@ -18,7 +18,7 @@ pub struct SceneTrainConfig {
     /// Weights of the encoder.
     pub encoder: PathBuf,
     /// Name of the scene.
-    pub town: String,
+    pub scene_name: String,
     /// Clusters of sensor positions.
     pub classes: i64,
     /// Clusters of world coordinates.

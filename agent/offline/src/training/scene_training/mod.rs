@@ -238,7 +238,7 @@ fn head_config(config: &SceneTrainConfig, features: &Features) -> Result<SceneHe
     let Features { training, encoder, encoder_sha256, .. } = features;
     let refiner = || key_grid::covering(&training.targets_m, encoder.local_channels());
     Ok(SceneHeadConfig {
-        town: config.town.clone(),
+        scene_name: config.scene_name.clone(),
         encoder_sha256: encoder_sha256.clone(),
         cell_channels: encoder.cell_channels(),
         sweep_channels: encoder.sweep_channels(),

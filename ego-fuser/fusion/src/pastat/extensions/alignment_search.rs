@@ -8,7 +8,7 @@ use protocol::Pose;
 use tch::{Kind, TchError, Tensor};
 
 use crate::pastat::config::SearchConfig;
-use crate::pastat::spatial_alignment::area::{Area, lattice};
+use crate::pastat::spatial_alignment::area::{Area, sampling_grid};
 use crate::pastat::spatial_alignment::correlation::{Shifted, shifts};
 use crate::pastat::spatial_alignment::network::AlignmentNetwork;
 use crate::pastat::spatial_alignment::pairs::{Displacements, Pairs, picked, rows_where};
@@ -155,7 +155,7 @@ fn turned_tries(
 fn turned(maps: &Tensor, turn_rad: f64, ego_from_cav: &[Pose], area: &Area) -> Result<Tensor, TchError> {
     let (count, _, rows, columns) = maps.size4()?;
     let turn = Tensor::f_from_slice(&[0.0, 0.0, turn_rad as f32])?.f_expand([count, 3], false)?;
-    let places = lattice(&turn, ego_from_cav, area, [rows, columns])?.f_to_device(maps.device())?;
+    let places = sampling_grid(&turn, ego_from_cav, area, [rows, columns])?.f_to_device(maps.device())?;
     maps.f_grid_sampler(&places, BILINEAR, PADDING_ZEROS, false)
 }
 

@@ -79,7 +79,12 @@ impl Area {
 ///
 /// A map is rotated about the position of its sender and then shifted, both in the ego's frame, so that an error of its
 /// pose's heading affects one number and not three.
-pub(crate) fn lattice(deltas: &Tensor, ego_from_cav: &[Pose], area: &Area, size: [i64; 2]) -> Result<Tensor, TchError> {
+pub(crate) fn sampling_grid(
+    deltas: &Tensor,
+    ego_from_cav: &[Pose],
+    area: &Area,
+    size: [i64; 2],
+) -> Result<Tensor, TchError> {
     let senders = planar_poses(ego_from_cav)?.f_to_device(deltas.device())?.f_narrow(1, 0, 2)?;
     // p_map = v + R^T (p_ego - v - d), with v the sender's position and d the shift.
     let moved = senders.f_constant_pad_nd([0, 1])? + deltas;
@@ -88,7 +93,11 @@ pub(crate) fn lattice(deltas: &Tensor, ego_from_cav: &[Pose], area: &Area, size:
 
 /// Positions of the ego's cells, on the grid of `area`, on maps in the frames of their senders, on `own`, given offsets
 /// `deltas` `[N, 3]` of the senders from their reported poses: `[N, H, W, 2]`.
-pub(crate) fn own_lattice(deltas: &Tensor, ego_from_cav: &[Pose], [area, own]: [&Area; 2]) -> Result<Tensor, TchError> {
+pub(crate) fn own_sampling_grid(
+    deltas: &Tensor,
+    ego_from_cav: &[Pose],
+    [area, own]: [&Area; 2],
+) -> Result<Tensor, TchError> {
     let moved = planar_poses(ego_from_cav)?.f_to_device(deltas.device())? + deltas;
     // p_cav = R^T (p_ego - v - d).
     places(&moved, &moved.f_narrow(1, 0, 2)?.f_zeros_like()?, [area, own], area.size)
@@ -118,17 +127,18 @@ fn places(pose: &Tensor, origin: &Tensor, [area, on]: [&Area; 2], size: [i64; 2]
     Tensor::f_affine_grid_generator(&affine, [pose.size2()?.0, 1, size[0], size[1]], false)
 }
 
-/// A sender's pose corrected by a `delta`, see [`lattice`].
+/// A sender's pose corrected by a `delta`, see [`sampling_grid`].
 pub(crate) fn moved(ego_from_cav: &Pose, delta: &[f64]) -> Pose {
     let [x, y, z] = ego_from_cav.translation_m;
     Pose::from_xyz_yaw([x + delta[0], y + delta[1], z], ego_from_cav.yaw_rad() + delta[2])
 }
 
-/// Maps `[N, C, H, W]` and their validity `[N, 1, H, W]`, sampled at `lattice`. Cells beyond their edges are invalid;
+/// Maps `[N, C, H, W]` and their validity `[N, 1, H, W]`, sampled at `sampling_grid`. Cells beyond their edges are invalid;
 /// the values of invalid cells are not zero.
-pub(crate) fn resample(maps: &Tensor, valid: &Tensor, lattice: &Tensor) -> Result<(Tensor, Tensor), TchError> {
-    let valid = valid.f_grid_sampler(&lattice.f_detach()?, NEAREST, PADDING_ZEROS, false)?.f_to_kind(Kind::Float)?;
-    Ok((maps.f_grid_sampler(lattice, BILINEAR, PADDING_ZEROS, false)?, valid))
+pub(crate) fn resample(maps: &Tensor, valid: &Tensor, sampling_grid: &Tensor) -> Result<(Tensor, Tensor), TchError> {
+    let valid =
+        valid.f_grid_sampler(&sampling_grid.f_detach()?, NEAREST, PADDING_ZEROS, false)?.f_to_kind(Kind::Float)?;
+    Ok((maps.f_grid_sampler(sampling_grid, BILINEAR, PADDING_ZEROS, false)?, valid))
 }
 
 #[cfg(test)]
@@ -148,8 +158,8 @@ mod tests {
 
     fn map_moved(maps: &Tensor, delta: [f32; 3], ego_from_cav: Pose) -> Tensor {
         let deltas = Tensor::from_slice(&delta).view([1, 3]);
-        let lattice = lattice(&deltas, &[ego_from_cav], &area(), [16, 32]).unwrap();
-        resample(maps, &Tensor::ones([1, 1, 16, 32], FLOAT), &lattice).unwrap().0
+        let sampling_grid = sampling_grid(&deltas, &[ego_from_cav], &area(), [16, 32]).unwrap();
+        resample(maps, &Tensor::ones([1, 1, 16, 32], FLOAT), &sampling_grid).unwrap().0
     }
 
     #[test]
@@ -170,7 +180,7 @@ mod tests {
         let deltas = Tensor::from_slice(&delta).to_kind(Kind::Float).view([1, 3]);
         // Padded rows and columns contain the ego's cells, and more.
         let padded = Area::new(&GRID, [20, 40], 4);
-        let places = own_lattice(&deltas, &[pose], [&padded, &area()]).unwrap();
+        let places = own_sampling_grid(&deltas, &[pose], [&padded, &area()]).unwrap();
         let (read, valid) = resample(&maps, &Tensor::ones([1, 1, 16, 32], FLOAT), &places).unwrap();
         let inside = |map: &Tensor| map.narrow(2, 0, 16).narrow(3, 0, 32);
         assert!((inside(&(read * &valid)) - by_pose.features).abs().mean(Kind::Float).double_value(&[]) < 1e-3);

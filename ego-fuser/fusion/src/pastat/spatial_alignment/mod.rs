@@ -12,7 +12,7 @@ pub(super) mod pairs;
 use protocol::BevGrid;
 use tch::{TchError, Tensor, nn};
 
-use self::area::{Area, lattice, own_lattice, resample};
+use self::area::{Area, own_sampling_grid, resample, sampling_grid};
 use self::neighbour_maps::NeighbourMaps;
 use self::network::AlignmentNetwork;
 use self::pairs::Displacements;
@@ -132,7 +132,7 @@ fn moved_tokens(
     let (entries, _, rows, columns) = values.size4()?;
     let after_first = |tensor: &Tensor| tensor.f_narrow(0, 1, entries - 1);
     let with_first = |first: &Tensor, after: Tensor| Tensor::f_cat(&[first.f_narrow(0, 0, 1)?, after], 0);
-    let places = lattice(deltas, &origins.ego_from_cav[1..], area, [rows, columns])?;
+    let places = sampling_grid(deltas, &origins.ego_from_cav[1..], area, [rows, columns])?;
     let (after, after_valid) = resample(&after_first(values)?, &after_first(valid)?.f_unsqueeze(1)?, &places)?;
     Ok((with_first(values, after)?, with_first(valid, after_valid.f_squeeze_dim(1)?)?))
 }
@@ -145,6 +145,6 @@ fn moved_maps(coarse: &CoarseMaps, deltas: &Tensor, area: &Area, grid: &BevGrid)
     }
     let own = Area::new(grid, [i64::from(grid.height), i64::from(grid.width)], area.radius());
     let (deltas, poses) = (deltas.f_narrow(0, 0, count)?, &coarse.origins.ego_from_cav[1..=count as usize]);
-    let places = own_lattice(&deltas, poses, [area, &own])?;
+    let places = own_sampling_grid(&deltas, poses, [area, &own])?;
     NeighbourMaps::at(coarse.received.only(1, count + 1)?, places)
 }

@@ -77,7 +77,7 @@ mod tests {
     use protocol::{BevGrid, Pose};
     use tch::Kind;
 
-    use super::super::area::{Area, own_lattice};
+    use super::super::area::{Area, own_sampling_grid};
     use super::*;
     use crate::test_data::uniform;
 
@@ -87,7 +87,7 @@ mod tests {
         let area = Area::new(&grid, [16, 32], 4);
         let poses = [Pose::from_xyz_yaw([3.0, 1.0, 0.0], 0.3), Pose::IDENTITY];
         let deltas = Tensor::from_slice(&[0.7f32, -0.4, 0.05, -1.3, 0.2, 0.0]).view([2, 3]);
-        let places = own_lattice(&deltas, &poses, [&area, &area]).unwrap();
+        let places = own_sampling_grid(&deltas, &poses, [&area, &area]).unwrap();
         let mask = uniform(4, &[2, 1, 16, 32]).gt(0.2).to_kind(Kind::Float);
         let features = (uniform(5, &[2, 3, 16, 32]) - 0.3) * &mask;
         let (own, weight) = (uniform(6, &[3, 16, 32]) - 0.5, uniform(7, &[2, 1, 16, 32]) * 2.0);

@@ -6,7 +6,7 @@ use protocol::Pose;
 use tch::nn::{self, Init, Module};
 use tch::{TchError, Tensor};
 
-use super::area::{Area, lattice, resample};
+use super::area::{Area, resample, sampling_grid};
 use super::correlation::{PARTS, Shifted, peaks, shifts};
 use super::pairs::{Displacements, Pairs};
 use crate::f64_tensor::pointwise;
@@ -145,7 +145,7 @@ fn moved(Pairs { shown, mask, ego_from_cav, .. }: &Pairs, deltas: &Tensor, area:
         return Ok(shown.shallow_clone());
     }
     let (.., height, width) = shown.size4()?;
-    let places = lattice(deltas, ego_from_cav, area, [height, width])?;
+    let places = sampling_grid(deltas, ego_from_cav, area, [height, width])?;
     let (moved, valid) = resample(shown, mask, &places)?;
     moved.f_mul(&valid)
 }
@@ -218,8 +218,8 @@ mod tests {
         let deltas = found.deltas;
         assert_eq!(deltas, Tensor::zeros([2, 3], FLOAT));
         let maps = Tensor::randn([2, 4, 16, 32], FLOAT);
-        let lattice = lattice(&deltas, &poses, &area(), [16, 32]).unwrap();
-        let (same, valid) = resample(&maps, &Tensor::ones([2, 1, 16, 32], FLOAT), &lattice).unwrap();
+        let sampling_grid = sampling_grid(&deltas, &poses, &area(), [16, 32]).unwrap();
+        let (same, valid) = resample(&maps, &Tensor::ones([2, 1, 16, 32], FLOAT), &sampling_grid).unwrap();
         assert!(same.allclose(&maps, 1e-4, 1e-4, false));
         assert_eq!(valid.min().double_value(&[]), 1.0);
         (same * Tensor::randn([2, 4, 16, 32], FLOAT)).sum(Kind::Float).backward();

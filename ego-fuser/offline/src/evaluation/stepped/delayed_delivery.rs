@@ -1,4 +1,4 @@
-//! Delayed delivery: messages between the agents and an ego in simulation time, handed over ahead, offered to the link
+//! Delayed delivery: messages between the agents and an ego in simulation time, handed over ahead, submitted to the link
 //! in order of time, and counted.
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -38,7 +38,7 @@ pub(super) struct DelayedDelivery {
     receiver: ProcessId,
     /// Time 0 of the link on the scene's clock.
     began_nanos: u64,
-    /// Messages to be offered, by time and number.
+    /// Messages to be submitted, by time and number.
     pending: BTreeMap<(u64, u64), Packet>,
     /// Messages that were handed over and neither arrived nor were lost yet.
     kept: BTreeMap<u64, Kept>,
@@ -106,39 +106,39 @@ impl DelayedDelivery {
         let id = self.next_id;
         self.next_id += 1;
         self.kept.insert(id, Kept { topic: topic(from, stream), envelope });
-        let offered_nanos = nanos.saturating_sub(self.began_nanos);
+        let submitted_nanos = nanos.saturating_sub(self.began_nanos);
         let (from, to) = (from.clone(), self.ego.clone());
-        let parcel = Packet { id, from, to, stream, sequence, bytes, offered_nanos, distance_m };
-        self.pending.insert((offered_nanos, id), parcel);
+        let packet = Packet { id, from, to, stream, sequence, bytes, submitted_nanos, distance_m };
+        self.pending.insert((submitted_nanos, id), packet);
     }
 
     /// Arrivals by `nanos`, in order of time. All messages that are sent until then have been handed over.
     pub(super) fn until(&mut self, nanos: u64) -> Vec<Arrived> {
         let nanos = nanos.saturating_sub(self.began_nanos);
         while let Some(entry) = self.pending.first_entry().filter(|entry| entry.key().0 <= nanos) {
-            let parcel = entry.remove();
-            self.ledger.sent(&Account::published(topic(&parcel.from, parcel.stream)));
-            self.sent_bytes += parcel.bytes;
-            self.link.offer(parcel);
+            let packet = entry.remove();
+            self.ledger.sent(&Account::published(topic(&packet.from, packet.stream)));
+            self.sent_bytes += packet.bytes;
+            self.link.submit(packet);
         }
         self.link.advance(nanos).into_iter().filter_map(|outcome| self.settle(outcome)).collect()
     }
 
     fn settle(&mut self, outcome: Outcome) -> Option<Arrived> {
-        let Outcome { nanos, parcel, fate } = outcome;
-        let account = Account::towards(topic(&parcel.from, parcel.stream), &self.receiver);
-        let envelope = match fate {
+        let Outcome { nanos, packet, delivery } = outcome;
+        let account = Account::towards(topic(&packet.from, packet.stream), &self.receiver);
+        let envelope = match delivery {
             Delivery::Dropped(reason) => {
-                self.kept.remove(&parcel.id);
+                self.kept.remove(&packet.id);
                 self.ledger.dropped(&account, reason);
                 return None;
             }
             Delivery::Arrived { is_repeated: true, .. } => {
                 // The copy counts as one more message.
                 self.ledger.sent(&account);
-                self.kept.get(&parcel.id).and_then(|kept| kept.envelope.clone())
+                self.kept.get(&packet.id).and_then(|kept| kept.envelope.clone())
             }
-            Delivery::Arrived { .. } => self.kept.remove(&parcel.id).and_then(|kept| kept.envelope),
+            Delivery::Arrived { .. } => self.kept.remove(&packet.id).and_then(|kept| kept.envelope),
         };
         match envelope {
             Some(envelope) => Some(Arrived { nanos: nanos.saturating_add(self.began_nanos), envelope }),
@@ -162,7 +162,7 @@ impl DelayedDelivery {
     /// Counts a vehicle's messages that neither arrived nor were lost; `waiting` messages of it have arrived and were
     /// never used.
     pub(super) fn close(&mut self, cav: &CavId, waiting: u64) {
-        let not_sent: BTreeSet<u64> = self.pending.values().map(|parcel| parcel.id).collect();
+        let not_sent: BTreeSet<u64> = self.pending.values().map(|packet| packet.id).collect();
         for (stream, waiting) in [(Stream::Pose, 0), (self.stream, waiting)] {
             let topic = topic(cav, stream);
             let under_way = self.kept.iter().filter(|(id, kept)| kept.topic == topic && !not_sent.contains(id)).count();

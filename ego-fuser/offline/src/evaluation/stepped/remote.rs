@@ -25,7 +25,7 @@ use super::super::Sent;
 use ego_fuser::ego::Content;
 
 /// Timeout of all vehicles together for a tick: for a busy machine, but not for one that has lost a process.
-const PATIENCE: Duration = Duration::from_secs(120);
+const TIMEOUT: Duration = Duration::from_secs(120);
 
 /// Error of the remote agents.
 #[derive(Debug, thiserror::Error)]
@@ -81,7 +81,7 @@ struct Answer {
 }
 
 impl RemotePool {
-    /// Waits until the process of every vehicle has joined, for `patience` at most. Each sends the stream named beside
+    /// Waits until the process of every vehicle has joined, for `timeout` at most. Each sends the stream named beside
     /// it. The wait ends when `stop` is requested.
     ///
     /// # Errors
@@ -89,7 +89,7 @@ impl RemotePool {
     pub fn connect(
         bus: &Bus,
         vehicles: &[(CavId, Stream)],
-        patience: Duration,
+        timeout: Duration,
         stop: &Stop,
     ) -> Result<Self, RemoteError> {
         let inbox = bus.inbox(2, 2 * vehicles.len());
@@ -111,7 +111,7 @@ impl RemotePool {
                 routes.push(route(stream, &here));
             }
         }
-        Barrier::new(routes).await_routes(bus)?.wait(patience)?;
+        Barrier::new(routes).await_routes(bus)?.wait(timeout)?;
         Ok(Self { inbox, sensors, _subscriptions: subscriptions })
     }
 
@@ -127,11 +127,11 @@ impl RemotePool {
             if let Some(world_from_lidar) = frame.world_from_lidar {
                 let source = GnssSource::Recorded;
                 let measured = Gnss { world_from_lidar, position_std_m: 0.0, heading_std_rad: 0.0, source };
-                gnss.offer(frame.capture_nanos, measured);
+                gnss.submit(frame.capture_nanos, measured);
             }
-            lidar.offer(frame.capture_nanos, Lidar { points: frame.points.clone() });
+            lidar.submit(frame.capture_nanos, Lidar { points: frame.points.clone() });
         }
-        let deadline = Instant::now() + PATIENCE;
+        let deadline = Instant::now() + TIMEOUT;
         let mut answers: BTreeMap<&CavId, Answer> =
             frames.iter().map(|frame| (&frame.cav, Answer::default())).collect();
         let is_open = |(_, answer): &(&&CavId, &Answer)| answer.pose.is_none() || answer.content.is_none();

@@ -104,12 +104,12 @@ impl Explorer {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::map::{TownSource, build};
+    use crate::map::{RoadMapSource, build};
 
     #[test]
     fn a_tour_visits_the_whole_map() {
-        let town = build(&TownSource::Town4, 0).unwrap();
-        let roads = Roads::new(&town.lanes);
+        let map_model = build(&RoadMapSource::Town4, 0).unwrap();
+        let roads = Roads::new(&map_model.lanes);
         let mut lane = roads.spawns[0].lane;
         let mut explorer = Explorer::new(&roads, lane);
         let count = explorer.is_road.iter().filter(|&&is_road| is_road).count();
@@ -117,7 +117,7 @@ mod tests {
             let mut onward = roads.onward(lane);
             explorer.keep_best(&mut onward);
             // Lane changes are part of the route where they shorten it.
-            let beside = [Side::Left, Side::Right].into_iter().filter_map(|side| side.of(town.lanes.lane(lane)));
+            let beside = [Side::Left, Side::Right].into_iter().filter_map(|side| side.of(map_model.lanes.lane(lane)));
             lane = beside.into_iter().find(|&beside| explorer.prefers(beside, lane)).unwrap_or(onward[0]);
             explorer.choose(lane);
         }

@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::generate::vehicle::Vehicle;
-use crate::map::{Lane, LaneGraph, LaneId, TownSource, build, lane_builder, opendrive};
+use crate::map::{Lane, LaneGraph, LaneId, RoadMapSource, build, lane_builder, opendrive};
 
 fn options(vehicles_per_km: f64) -> TrafficOptions {
     TrafficOptions { vehicles_per_km, radius_m: 210.0, focus_explores: false }
@@ -22,19 +22,19 @@ fn overlaps(traffic: &Traffic<'_>) -> Vec<(i64, i64)> {
 
 #[test]
 fn no_vehicles_overlap_and_most_move() {
-    for source in [TownSource::Town1, TownSource::Town4] {
-        let town = build(&source, 0).unwrap();
-        let roads = Roads::new(&town.lanes);
+    for source in [RoadMapSource::Town1, RoadMapSource::Town4] {
+        let map_model = build(&source, 0).unwrap();
+        let roads = Roads::new(&map_model.lanes);
         for seed in 0..3 {
             let start = roads.spawns[SplitMix64::new(seed).below(roads.spawns.len())];
             let mut traffic = Traffic::new(&roads, &[], options(35.0), start, seed);
-            assert!(traffic.cars.len() > 20, "{}: {} vehicles", town.name, traffic.cars.len());
+            assert!(traffic.cars.len() > 20, "{}: {} vehicles", map_model.name, traffic.cars.len());
             let (mut moving, mut all, mut changing) = (0, 0, 0);
             for step in 0..1200 {
                 traffic.step();
                 changing += traffic.cars.iter().filter(|car| car.path.is_changing()).count();
                 if step % 5 == 0 {
-                    assert_eq!(overlaps(&traffic), [], "{} seed {seed} step {step}", town.name);
+                    assert_eq!(overlaps(&traffic), [], "{} seed {seed} step {step}", map_model.name);
                 }
                 if step > 600 {
                     let present = traffic.cars.iter().filter(|car| car.is_present);
@@ -42,9 +42,9 @@ fn no_vehicles_overlap_and_most_move() {
                     moving += present.filter(|car| car.speed_mps > 0.5).count();
                 }
             }
-            assert!(moving * 2 > all, "{} seed {seed}: {moving} of {all} vehicle steps are moving", town.name);
+            assert!(moving * 2 > all, "{} seed {seed}: {moving} of {all} vehicle steps are moving", map_model.name);
             // The first map has one lane each way.
-            assert_eq!(changing > 0, source == TownSource::Town4, "{} seed {seed}: {changing}", town.name);
+            assert_eq!(changing > 0, source == RoadMapSource::Town4, "{} seed {seed}: {changing}", map_model.name);
         }
     }
 }
@@ -136,28 +136,28 @@ fn no_lane_change_causes_a_collision() {
 
 #[test]
 fn an_exploring_focus_drives_several_lanes_of_a_road() {
-    let town = build(&TownSource::Town4, 0).unwrap();
-    let roads = Roads::new(&town.lanes);
+    let map_model = build(&RoadMapSource::Town4, 0).unwrap();
+    let roads = Roads::new(&map_model.lanes);
     let options = TrafficOptions { focus_explores: true, ..options(12.0) };
     let mut both = 0;
     for seed in 0..4 {
         let start = roads.spawns[SplitMix64::new(seed).below(roads.spawns.len())];
         let mut traffic = Traffic::new(&roads, &[], options, start, seed);
-        let mut driven = vec![false; town.lanes.lanes.len()];
+        let mut driven = vec![false; map_model.lanes.lanes.len()];
         for _ in 0..3600 {
             traffic.step();
             driven[traffic.cars[0].path.lane().0 as usize] = true;
         }
         let is_driven = |lane: &Option<LaneId>| lane.is_some_and(|lane| driven[lane.0 as usize]);
-        both += town.lanes.lanes.iter().filter(|lane| driven[lane.id.0 as usize] && is_driven(&lane.left)).count();
+        both += map_model.lanes.lanes.iter().filter(|lane| driven[lane.id.0 as usize] && is_driven(&lane.left)).count();
     }
     assert!(both >= 4, "{both} lanes were driven beside another one");
 }
 
 #[test]
 fn the_same_seed_drives_the_same_way() {
-    let town = build(&TownSource::Town1, 0).unwrap();
-    let roads = Roads::new(&town.lanes);
+    let map_model = build(&RoadMapSource::Town1, 0).unwrap();
+    let roads = Roads::new(&map_model.lanes);
     let end = |seed| {
         let mut traffic = Traffic::new(&roads, &[], options(30.0), roads.spawns[10], seed);
         (0..400).for_each(|_| traffic.step());
@@ -169,8 +169,8 @@ fn the_same_seed_drives_the_same_way() {
 
 #[test]
 fn knots_come_undone() {
-    let town = build(&TownSource::Town4, 0).unwrap();
-    let roads = Roads::new(&town.lanes);
+    let map_model = build(&RoadMapSource::Town4, 0).unwrap();
+    let roads = Roads::new(&map_model.lanes);
     let options = TrafficOptions { focus_explores: true, ..options(14.0) };
     // Seeds whose roundabouts fill up within six minutes.
     for seed in [0, 6, 23] {

@@ -36,12 +36,12 @@ pub(crate) fn lay_out(seed: u64) -> Layout {
     let link = link_road(&mut builder, &inside, &outside);
     // Arms by rising angle: 0 is away from the town inside, and away from the ring outside.
     let ramps = interchange(&mut builder, &motorway, &inside, &outside, &mut rng);
-    let town = town(&mut builder, &motorway, &inside, &mut rng);
+    let map_model = map_model(&mut builder, &motorway, &inside, &mut rng);
     let works = works(&mut builder, &outside, &mut rng);
     let [off_inside, on_inside, off_outside, on_outside] = ramps;
     let start = |road| RoadEnd { road, contact: Contact::Start };
     let end = |road| RoadEnd { road, contact: Contact::End };
-    let arms = [(0.0, start(link)), (FRAC_PI_2, end(off_inside)), (PI, town), (-FRAC_PI_2, start(on_inside))];
+    let arms = [(0.0, start(link)), (FRAC_PI_2, end(off_inside)), (PI, map_model), (-FRAC_PI_2, start(on_inside))];
     inside.join(&mut builder, &arms);
     let arms = [(0.0, works), (FRAC_PI_2, start(on_outside)), (PI, end(link)), (-FRAC_PI_2, end(off_outside))];
     outside.join(&mut builder, &arms);
@@ -104,7 +104,7 @@ fn interchange(
 }
 
 /// The small town inside the ring; returns the street's end at the roundabout.
-fn town(builder: &mut Builder, motorway: &Motorway, inside: &Roundabout, rng: &mut ChaCha8Rng) -> RoadEnd {
+fn map_model(builder: &mut Builder, motorway: &Motorway, inside: &Roundabout, rng: &mut ChaCha8Rng) -> RoadEnd {
     let port = inside.port(PI);
     let (east, west) =
         (port.x - rng.random_range(30.0..45.0), motorway.ring.pose(0.0).x + rng.random_range(150.0..175.0));

@@ -1,14 +1,14 @@
 use super::super::convex::{Rectangle, overlap};
-use super::super::{SolidKind, TownSource, build};
+use super::super::{RoadMapSource, SolidKind, build};
 use super::site::outline;
 
 #[test]
 fn nothing_stands_on_a_lane() {
-    for source in [TownSource::Town1, TownSource::Town4] {
+    for source in [RoadMapSource::Town1, RoadMapSource::Town4] {
         for seed in [0, 1, 2, 3] {
-            let town = build(&source, seed).unwrap();
-            let found = town.obstructions();
-            let first = found.first().map(|&(lane, solid)| (lane, town.solids[solid]));
+            let map_model = build(&source, seed).unwrap();
+            let found = map_model.obstructions();
+            let first = found.first().map(|&(lane, solid)| (lane, map_model.solids[solid]));
             assert!(found.is_empty(), "{source:?} {seed}: {} such as {first:?}", found.len());
         }
     }
@@ -16,13 +16,13 @@ fn nothing_stands_on_a_lane() {
 
 #[test]
 fn parking_spots_are_free() {
-    for source in [TownSource::Town1, TownSource::Town4] {
-        let town = build(&source, 1).unwrap();
-        for spot in &town.parking {
+    for source in [RoadMapSource::Town1, RoadMapSource::Town4] {
+        let map_model = build(&source, 1).unwrap();
+        for spot in &map_model.parking {
             let [x, y, z] = spot.center_m;
             // A car's outline within the spot, up to the height of a van.
             let car = Rectangle { center_m: [x, y], half_m: [2.2, 0.85], yaw_rad: spot.yaw_rad }.corners();
-            let blocked = town.solids.iter().find(|solid| {
+            let blocked = map_model.solids.iter().find(|solid| {
                 solid.bottom_m() < z + 2.0 && solid.top_m() > z + 0.1 && overlap(&outline(solid).corners(), &car)
             });
             assert!(blocked.is_none(), "{source:?}: {spot:?} holds {blocked:?}");
@@ -32,18 +32,18 @@ fn parking_spots_are_free() {
 
 #[test]
 fn streets_are_lined_with_buildings_trees_and_parking() {
-    let town = build(&TownSource::Town1, 4).unwrap();
-    let count = |kind| town.solids.iter().filter(|solid| solid.kind == kind).count();
+    let map_model = build(&RoadMapSource::Town1, 4).unwrap();
+    let count = |kind| map_model.solids.iter().filter(|solid| solid.kind == kind).count();
     assert!(count(SolidKind::Building) > 500, "{}", count(SolidKind::Building));
     assert!(count(SolidKind::TreeTrunk) > 200, "{}", count(SolidKind::TreeTrunk));
     assert!(count(SolidKind::Pole) > 100, "{}", count(SolidKind::Pole));
-    assert!(town.parking.len() > 200, "{}", town.parking.len());
+    assert!(map_model.parking.len() > 200, "{}", map_model.parking.len());
 }
 
 #[test]
 fn motorways_have_barriers_walls_pillars_and_a_tunnel() {
-    let town = build(&TownSource::Town4, 4).unwrap();
-    let count = |kind| town.solids.iter().filter(|solid| solid.kind == kind).count();
+    let map_model = build(&RoadMapSource::Town4, 4).unwrap();
+    let count = |kind| map_model.solids.iter().filter(|solid| solid.kind == kind).count();
     for (kind, least) in [
         (SolidKind::Barrier, 1000),
         (SolidKind::NoiseWall, 100),

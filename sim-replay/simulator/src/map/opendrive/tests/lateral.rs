@@ -75,17 +75,17 @@ fn lanes_bank_with_their_road_to_either_side() {
 #[test]
 fn the_ground_meets_the_banked_surface() {
     let network = banked();
-    let town = place_roadside("banked".into(), &Layout { network: network.clone(), islands: Vec::new() }, 1);
+    let map_model = place_roadside("banked".into(), &Layout { network: network.clone(), islands: Vec::new() }, 1);
     for (road, ts) in network.roads.iter().zip([[-3.9, -2.0, 0.5, 3.9], [-3.5, -1.0, 1.5, 3.5]]) {
         for place in 2..40 {
             for t in ts {
                 let [x, y, z] = road.point_at(0, 2.0 * f64::from(place), t);
-                let ground = town.ground.height_m(x, y);
+                let ground = map_model.ground.height_m(x, y);
                 assert!((ground - z).abs() < 0.13, "road {} at t={t}: ground {ground}, road {z}", road.id);
             }
         }
     }
-    assert!(town.obstructions().is_empty(), "{:?}", town.obstructions());
+    assert!(map_model.obstructions().is_empty(), "{:?}", map_model.obstructions());
 }
 
 #[test]

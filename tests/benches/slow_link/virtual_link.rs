@@ -13,7 +13,7 @@ use anyhow::{Context, Result, bail};
 use bus::{BusOptions, Endpoint, open};
 use zenoh::{Config, Session, Wait};
 
-use super::ends::{self, Seen};
+use super::ends::{self, Measurement};
 use super::{Cell, Way};
 
 const AGENT: &str = "v2v-slow-agent";
@@ -21,8 +21,8 @@ const EGO: &str = "v2v-slow-ego";
 const ROUTER: &str = "tcp/10.77.1.1:7447";
 
 /// One run over the virtual link.
-pub(crate) fn over_cable(cell: &Cell, way: Way) -> Result<Seen> {
-    let _cable = Cable::lay(cell.rate_mbps)?;
+pub(crate) fn over_virtual_link(cell: &Cell, way: Way) -> Result<Measurement> {
+    let _link = VirtualLink::lay(cell.rate_mbps)?;
     let mut ego = start(EGO, way, cell)?;
     let mut from_ego = BufReader::new(ego.stdout.take().context("a pipe")?);
     let mut ready = String::new();
@@ -35,8 +35,8 @@ pub(crate) fn over_cable(cell: &Cell, way: Way) -> Result<Seen> {
     if !ego.wait()?.success() || !agent.status.success() {
         bail!("an end of the cable failed: see above");
     }
-    let ego: Seen = serde_json::from_str(&text)?;
-    let mut seen: Seen = serde_json::from_slice(&agent.stdout)?;
+    let ego: Measurement = serde_json::from_str(&text)?;
+    let mut seen: Measurement = serde_json::from_slice(&agent.stdout)?;
     seen.arrivals = ego.arrivals;
     seen.ledger.merge(&ego.ledger);
     Ok(seen)
@@ -58,33 +58,33 @@ pub(crate) fn run_end(arguments: &[String]) -> Result<()> {
         (true, false) => ego()?,
         (false, true) => {
             let session = plain_session("client")?;
-            let offers = ends::send_plain(&session, &cell)?;
+            let submissions = ends::send_plain(&session, &cell)?;
             // Time for the messages in buffers.
             thread::sleep(Duration::from_secs_f64((cell.on_the_wire_ms() / 1e3).min(20.0)));
             session.close().wait().map_err(anyhow::Error::from_boxed)?;
-            Seen { offers, ..Seen::default() }
+            Measurement { submissions, ..Measurement::default() }
         }
         (false, false) => {
             let agent = ends::join(&Endpoint::new(ROUTER)?, "agent-7", "7")?;
-            let offers = ends::send(&agent, &cell, &[(ends::sent_topic(), "ego-9")])?;
-            let ledger = agent.books().ledger();
+            let submissions = ends::send(&agent, &cell, &[(ends::sent_topic(), "ego-9")])?;
+            let ledger = agent.stats().ledger();
             agent.leave(Duration::from_secs(20))?;
-            Seen { offers, ledger, ..Seen::default() }
+            Measurement { submissions, ledger, ..Measurement::default() }
         }
     };
     println!("{}", serde_json::to_string(&seen)?);
     Ok(())
 }
 
-fn ego() -> Result<Seen> {
+fn ego() -> Result<Measurement> {
     let _router = open(&BusOptions::router(Endpoint::new(ROUTER)?))?;
     let ego = ends::join(&Endpoint::new(ROUTER)?, "ego-9", "9")?;
     print_ready()?;
     let arrivals = ends::receive(&ego, &ends::sent_topic())?;
-    Ok(Seen { arrivals, ledger: ego.books().ledger(), ..Seen::default() })
+    Ok(Measurement { arrivals, ledger: ego.stats().ledger(), ..Measurement::default() })
 }
 
-fn plain_ego() -> Result<Seen> {
+fn plain_ego() -> Result<Measurement> {
     let _router = plain_session("router")?;
     let session = plain_session("client")?;
     print_ready()?;
@@ -94,7 +94,10 @@ fn plain_ego() -> Result<Seen> {
         let _ = std::io::stdin().read_to_end(&mut Vec::new());
         over.store(true, Ordering::Relaxed);
     });
-    Ok(Seen { arrivals: ends::receive_plain(&session, || is_over.load(Ordering::Relaxed))?, ..Seen::default() })
+    Ok(Measurement {
+        arrivals: ends::receive_plain(&session, || is_over.load(Ordering::Relaxed))?,
+        ..Measurement::default()
+    })
 }
 
 fn print_ready() -> Result<()> {
@@ -120,13 +123,13 @@ fn plain_session(mode: &str) -> Result<Session> {
 }
 
 /// Two hosts and their virtual link; removed when dropped.
-struct Cable;
+struct VirtualLink;
 
-impl Cable {
+impl VirtualLink {
     fn lay(rate_mbps: f64) -> Result<Self> {
         // Left behind by a run that was killed.
         drop(Self);
-        let cable = Self;
+        let link = Self;
         for host in [AGENT, EGO] {
             ip(&format!("netns add {host}"))?;
             ip(&format!("-n {host} link set lo up"))?;
@@ -140,11 +143,11 @@ impl Cable {
         let shape =
             format!("netns exec {AGENT} tc qdisc add dev slow1 root tbf rate {rate_mbps}mbit burst 64kb latency 50ms");
         ip(&shape)?;
-        Ok(cable)
+        Ok(link)
     }
 }
 
-impl Drop for Cable {
+impl Drop for VirtualLink {
     fn drop(&mut self) {
         for host in [AGENT, EGO] {
             let _ = Command::new("ip").args(["netns", "del", host]).stderr(Stdio::null()).status();
