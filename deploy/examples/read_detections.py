@@ -29,7 +29,7 @@ with zenoh.open(config) as session:
         frame = json.loads(sample.payload.to_string())
         ages = ", ".join(f"{one['cav']} ({one['age_nanos'] / 1e6:.0f} ms old)" for one in frame["fused"])
         print(f"ego {frame['ego']} frame {frame['agent_frame']} at {frame['capture_nanos'] / 1e9:.1f} s,"
-              f" {frame['method']}, with {ages or 'nobody'}:")
+              f" {frame['method']}, with {ages or 'no neighbour'}:")
         for found in frame["detections"]:
             (x, y, z), (l, w, h) = found["box"]["center_m"], found["box"]["size_m"]
             print(f"  score {found['score']:.2f}  x {x:6.1f}  y {y:6.1f}  z {z:5.1f}  {l:.1f} x {w:.1f} x {h:.1f} m"

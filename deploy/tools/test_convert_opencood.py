@@ -286,12 +286,12 @@ class Networks(Conversions):
         self.assertEqual(self.method(hypes("point_pillar_baseline", "intermediate", fusion_method="max")), "max")
 
     def test_compression_takes_its_tensors_along_and_says_what_is_sent(self):
-        squeezed = json.dumps(hypes(compression=4))
-        code, text, _ = self.convert(archive(state(compress_ratio=4)), squeezed)
+        compressed = json.dumps(hypes(compression=4))
+        code, text, _ = self.convert(archive(state(compress_ratio=4)), compressed)
         self.assertEqual(code, 0)
         self.assertIn("4 of 16 channels", text)
         self.assertEqual(json.loads(self.written()[1]["config"])["compress_ratio"], 4)
-        self.assert_refused(self.convert(archive(state()), squeezed), "missing", "naive_compressor.decoder.0.bias")
+        self.assert_refused(self.convert(archive(state()), compressed), "missing", "naive_compressor.decoder.0.bias")
         self.assert_refused(self.convert(archive(state(compress_ratio=4))), "does not have", "naive_compressor")
 
     def test_every_tensor_is_used_or_named(self):

@@ -135,15 +135,15 @@ fn absurd_shapes_in_the_metadata_are_refused() {
 
 #[test]
 fn a_code_has_no_more_channels_than_its_map_and_the_map_no_more_than_the_limit() {
-    for (widened, is_right) in [(2, false), (3, true), (1024, true), (1025, false), (u32::MAX, false)] {
+    for (decoded, is_right) in [(2, false), (3, true), (1024, true), (1025, false), (u32::MAX, false)] {
         let mut bev = sample::compressed_bev();
-        bev.features.code_of = Some(widened);
+        bev.features.code_of = Some(decoded);
         // An attacker can write a message that the encoder rejects.
         let encoded = wire::encode(&sample::stamp(), bev);
-        assert_eq!(encoded.is_ok(), widened > 2, "{widened}");
+        assert_eq!(encoded.is_ok(), decoded > 2, "{decoded}");
         let Ok(encoded) = encoded else { continue };
         match decode(&encoded.to_vec()) {
-            Ok((_, Message::Bev(bev))) => assert!(is_right && bev.features.code_of == Some(widened), "{widened}"),
+            Ok((_, Message::Bev(bev))) => assert!(is_right && bev.features.code_of == Some(decoded), "{decoded}"),
             Ok(other) => panic!("{other:?}"),
             Err(error) => assert!(!is_right && error.drop_reason() == DropReason::Shape, "{error}"),
         }

@@ -88,7 +88,7 @@ impl GuardedRouter {
     pub fn options(&self, holder: &str) -> BusOptions {
         let credentials = Credentials::read(&self.keys.join(holder)).expect("keys");
         let mut options = BusOptions::client(self.endpoint.clone()).with_credentials(credentials);
-        options.timeout = Duration::from_secs(20);
+        options.connect_timeout = Duration::from_secs(20);
         options
     }
 

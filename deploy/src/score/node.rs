@@ -202,16 +202,16 @@ impl ScorerNode {
     pub fn finish(self) -> Scored {
         self.inbox.close();
         let (board, stats, unwritten) = self.thread.join().expect("the scorer's thread has no reason to panic");
-        let stats = self.bus.stats();
+        let own_stats = self.bus.stats();
         let process = self.bus.identity().process.clone();
         let cpu_before_s = stats.values().find(|stats| stats.process == process).map_or(0.0, |own| own.cpu_before_s);
         let own = ProcessStats {
             process,
-            ledger: stats.ledger(),
-            stages: stats.stages(),
+            ledger: own_stats.ledger(),
+            stages: own_stats.stages(),
             usage: process_usage(),
             cpu_before_s,
-            traffic: stats.traffic(),
+            traffic: own_stats.traffic(),
         };
         let progress = self.progress.lock().unwrap_or_else(PoisonError::into_inner).clone();
         drop((self._subscriptions, self._presence, self.offline));

@@ -258,19 +258,19 @@ fn codes_are_fused_as_the_maps_that_they_stand_for_and_no_others() {
     let together = ego.detect(&own, std::slice::from_ref(&other)).unwrap();
     assert_eq!(together.fused, [0]);
     // The same network without a compressor is given the decompressed maps.
-    let widened = |view: &View| {
+    let decompressed = |view: &View| {
         let Content::Features(map) = &view.content else { panic!("max exchanges maps") };
         let features = detector().to_message(&compressed(4).received(map).unwrap()).unwrap();
         View { content: Content::Features(DecodedFeatures { features, sent: None }), ..view.clone() }
     };
     let mut plain = Ego::new(detector(), Method::MAX).unwrap();
-    assert_eq!(plain.detect(&widened(&own), &[widened(&other)]).unwrap().detections, together.detections);
+    assert_eq!(plain.detect(&decompressed(&own), &[decompressed(&other)]).unwrap().detections, together.detections);
     // As many channels, but of another map; and a map where a compressed code is expected.
     let mut of_another = other.clone();
     let Content::Features(map) = &mut of_another.content else { panic!("max exchanges maps") };
     map.features.code_of = Some(128);
-    let strangers = [of_another, widened(&other), view_by(compressed(8), "b", near(), Method::MAX, 0.1)];
-    let skipped = ego.detect(&own, &strangers).unwrap().skipped;
+    let mismatched = [of_another, decompressed(&other), view_by(compressed(8), "b", near(), Method::MAX, 0.1)];
+    let skipped = ego.detect(&own, &mismatched).unwrap().skipped;
     assert_eq!(skipped, [0, 1, 2].map(|index| (index, Skipped::Unusable(DropReason::Shape))));
 }
 

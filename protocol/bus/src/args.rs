@@ -88,7 +88,7 @@ impl BusConfig {
             Some(listen) => BusOptions::router(listen.clone()),
             None => BusOptions::client(self.connect.clone()),
         };
-        options.timeout = Duration::try_from_secs_f64(self.connect_timeout_s).unwrap_or(Duration::ZERO);
+        options.connect_timeout = Duration::try_from_secs_f64(self.connect_timeout_s).unwrap_or(Duration::ZERO);
         options.shared_memory_pool = Some(self.shared_memory_mib << 20).filter(|bytes| *bytes > 0);
         options.max_message_bytes = self.max_message_mib << 20;
         Ok(match &self.keys {

@@ -55,7 +55,7 @@ pub struct BusOptions {
     /// Router or client, with its endpoint.
     pub role: Role,
     /// Timeout of a client for reaching the router.
-    pub timeout: Duration,
+    pub connect_timeout: Duration,
     /// Bytes of shared memory for large messages on one machine; `None` keeps all messages on the socket, which
     /// experiments with an emulated link need. At least three times the bytes of all feature maps in flight at once.
     pub shared_memory_pool: Option<usize>,
@@ -86,7 +86,7 @@ impl BusOptions {
     fn with_role(role: Role, stall_limit: Duration) -> Self {
         Self {
             role,
-            timeout: Duration::from_secs(10),
+            connect_timeout: Duration::from_secs(10),
             shared_memory_pool: None,
             // Twice a full feature map of OpenCOOD's size (256 x 48 x 176 cells of f32 at stride 4 are 8.7 MB) and
             // every cloud.
@@ -147,7 +147,7 @@ impl BusOptions {
             ("listen/timeout_ms", json!(0)),
             ("listen/exit_on_failure", json!(true)),
             ("connect/endpoints", json!(connect)),
-            ("connect/timeout_ms", json!(millis(self.timeout))),
+            ("connect/timeout_ms", json!(millis(self.connect_timeout))),
             ("connect/exit_on_failure", json!(true)),
             (
                 "connect/retry",

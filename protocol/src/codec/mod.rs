@@ -241,12 +241,12 @@ impl EncodedFeatures {
         if self.grid != *grid {
             return Err(WireError::Grid { expected: grid.to_string(), found: self.grid.to_string() });
         }
-        let widened = |channels: u32, code_of: Option<u32>| u64::from(code_of.unwrap_or(channels));
+        let decoded = |channels: u32, code_of: Option<u32>| u64::from(code_of.unwrap_or(channels));
         if self.channels != channels {
             return Err(WireError::Shape { what: "channels", expected: channels.into(), found: self.channels.into() });
         }
         if self.code_of != code_of {
-            let (expected, found) = (widened(channels, code_of), widened(self.channels, self.code_of));
+            let (expected, found) = (decoded(channels, code_of), decoded(self.channels, self.code_of));
             return Err(WireError::Shape { what: "channels of the map behind the compressor", expected, found });
         }
         Ok(())

@@ -66,12 +66,12 @@ impl Payload for Bev {
 
 /// A code has no more channels than the map that it encodes, and the map no more than permitted.
 fn check_code(channels: u32, code_of: Option<u32>, limits: &Limits) -> Result<(), WireError> {
-    let Some(widened) = code_of else { return Ok(()) };
-    if widened > limits.max_channels {
-        return Err(WireError::Limit { what: "channels", max: limits.max_channels.into(), found: widened.into() });
+    let Some(decoded) = code_of else { return Ok(()) };
+    if decoded > limits.max_channels {
+        return Err(WireError::Limit { what: "channels", max: limits.max_channels.into(), found: decoded.into() });
     }
-    if channels > widened {
-        let (expected, found) = (widened.into(), channels.into());
+    if channels > decoded {
+        let (expected, found) = (decoded.into(), channels.into());
         return Err(WireError::Shape { what: "channels of a code", expected, found });
     }
     Ok(())

@@ -139,7 +139,7 @@ fn any_detections() -> impl Strategy<Value = Detections> {
     let neighbours = (vec(fused, 0..4), vec(skipped, 0..4), vec(states, 0..4));
     let lists = (vec(any_detection(), 0..20), neighbours, vec(any_timing(), 0..4));
     (any_cav(), any::<u64>(), "[a-z]{1,10}", any_estimate(), lists).prop_map(
-        |(ego, agent_frame, method, pose, (detections, (fused, skipped, heard), stages))| Detections {
+        |(ego, agent_frame, method, pose, (detections, (fused, skipped, neighbours), stages))| Detections {
             ego,
             agent_frame,
             method,

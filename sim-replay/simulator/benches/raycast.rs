@@ -53,10 +53,10 @@ fn vehicles(map_model: &MapModel, around: &Placement) -> Vec<(Vehicle, Sweep)> {
 }
 
 fn bench_map(criterion: &mut Criterion, name: &str, source: &RoadMapSource) {
-    let map_model = build(source, 0).expect("procedural towns always build");
+    let map_model = build(source, 0).expect("procedural maps always build");
     let sensor = sensor_motion(&map_model);
     let ground = ground_surface(&map_model);
-    let standing: Vec<(BodyShape, Placement)> = town
+    let standing: Vec<(BodyShape, Placement)> = map_model
         .solids
         .iter()
         .map(|solid| (BodyShape::from(solid), Placement::level(solid.center_m, solid.yaw_rad)))

@@ -180,7 +180,7 @@ mod tests {
     }
 
     #[test]
-    fn maps_are_names_or_maps() {
+    fn maps_are_names_or_files() {
         assert_eq!(parse_map("town4"), Ok(RoadMapSource::Town4));
         assert_eq!(parse_map("a/Town01.xodr"), Ok(RoadMapSource::OpenDrive("a/Town01.xodr".into())));
         assert!(parse_map("town2").is_err());

@@ -152,7 +152,7 @@ impl ReplayConfig {
             load: LoadOptions { lidar_variant: scene.variant.clone(), points: true, radar: scene.radar },
             await_agents: wait.await_agents,
             expect: wait.expect.clone(),
-            timeout: seconds(wait.ready_timeout_s),
+            ready_timeout: seconds(wait.ready_timeout_s),
             lockstep: if scene.lockstep { wait.egos.clone() } else { Vec::new() },
             answer_timeout: seconds(wait.answer_timeout_s),
             link: self.sensor_link.stages().map(|link| (link, self.sensor_link.seed)),

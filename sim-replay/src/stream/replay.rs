@@ -48,7 +48,7 @@ pub struct StreamOptions {
     /// Further routes that must be up before the clock starts.
     pub expect: Vec<Route>,
     /// Longest time to wait for the routes.
-    pub timeout: Duration,
+    pub ready_timeout: Duration,
     /// Egos whose detections of a tick are awaited before the next; empty: the clock does not wait.
     pub lockstep: Vec<CavId>,
     /// Longest time to wait for an ego's detections; then the tick counts as unanswered.
@@ -71,7 +71,7 @@ impl Default for StreamOptions {
             load: LoadOptions::default(),
             await_agents: true,
             expect: Vec::new(),
-            timeout: Duration::from_secs(60),
+            ready_timeout: Duration::from_secs(60),
             lockstep: Vec::new(),
             answer_timeout: Duration::from_secs(60),
             link: None,
@@ -223,11 +223,11 @@ impl<'a> Replay<'a> {
         let stop = self.stop.clone();
         let wait = |timeout| barrier.wait_unless(timeout, || stop.requested());
         if !self.is_resumed {
-            return Ok(wait(self.options.timeout)?);
+            return Ok(wait(self.options.ready_timeout)?);
         }
         let (tick, ticks) = (self.schedule.position().next_tick, self.tick_count);
         tracing::warn!(tick, ticks, "resuming from the checkpoint of the previous process instance");
-        if let Err(not_ready) = wait(RESUME_TIMEOUT.min(self.options.timeout)) {
+        if let Err(not_ready) = wait(RESUME_TIMEOUT.min(self.options.ready_timeout)) {
             tracing::warn!("the replay continues, although {not_ready}");
         }
         Ok(())

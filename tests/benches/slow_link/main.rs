@@ -4,7 +4,7 @@
 //! An agent offers a feature map at 10 Hz. Three connections to the ego take turns for every rate and size:
 //!
 //! - `link`: the bus, with the emulated link of `sim-replay link` between (KEEP_LAST(1) queue);
-//! - `cable`: the bus over a real slow link, two network namespaces whose virtual link is shaped by a token bucket (`tc
+//! - `veth`: the bus over a real slow link, two network namespaces whose virtual link is shaped by a token bucket (`tc
 //! qdisc add .. tbf`);
 //! - `plain`: zenoh over the same virtual link with its default settings.
 //!
@@ -143,7 +143,7 @@ fn measure(wanted: &Wanted) -> Result<Vec<Row>> {
 
 fn main() -> Result<ExitCode> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
-    // One end of the cable, in a namespace of its own.
+    // One end of the virtual link, in a namespace of its own.
     if arguments.first().is_some_and(|argument| argument == "end") {
         virtual_link::run_end(&arguments[1..])?;
         return Ok(ExitCode::SUCCESS);

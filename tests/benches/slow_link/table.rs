@@ -150,7 +150,7 @@ pub(crate) fn write(folder: &Path, arguments: &str, rows: &[Row]) -> Result<()> 
     Ok(())
 }
 
-/// Age of the newest feature map at every millisecond from the first arrival to the last offer.
+/// Age of the newest feature map at every millisecond from the first arrival to the last submission.
 fn ages_ms(seen: &Measurement) -> Vec<f64> {
     let end_nanos = seen.submissions.last().map_or(0, |submit| submit.capture_nanos);
     let mut arrivals = seen.arrivals.iter().peekable();

@@ -33,7 +33,7 @@ pub(crate) fn over_virtual_link(cell: &Cell, way: Way) -> Result<Measurement> {
     let mut text = String::new();
     from_ego.read_to_string(&mut text)?;
     if !ego.wait()?.success() || !agent.status.success() {
-        bail!("an end of the cable failed: see above");
+        bail!("an end of the virtual link failed: see above");
     }
     let ego: Measurement = serde_json::from_str(&text)?;
     let mut seen: Measurement = serde_json::from_slice(&agent.stdout)?;

@@ -260,7 +260,7 @@ fn an_agent_that_does_not_come_is_named() {
     let _subscriptions =
         [Stream::Lidar, Stream::Gnss].map(|stream| agent.subscribe(topic("10", stream), &inbox).unwrap());
     let bus = router.join("replay", "replay");
-    let options = StreamOptions { timeout: Duration::from_millis(400), ..StreamOptions::default() };
+    let options = StreamOptions { ready_timeout: Duration::from_millis(400), ..StreamOptions::default() };
     let replay = Replay::prepare(&bus, &scenario, options, &Stop::new()).unwrap();
     let error = replay.wait_until_ready().unwrap_err().to_string();
     assert!(error.contains("20/lidar>agent-20, 20/gnss>agent-20") && !error.contains("10/"), "{error}");

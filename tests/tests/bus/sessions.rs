@@ -340,7 +340,7 @@ fn a_port_in_use_and_a_missing_router_are_named() {
 
     let nowhere = Endpoint::loopback(free_port());
     let mut options = BusOptions::client(nowhere.clone());
-    options.timeout = Duration::from_millis(300);
+    options.connect_timeout = Duration::from_millis(300);
     let error = bus::open(&options).unwrap_err();
     assert!(matches!(&error, BusError::Unreachable { endpoint, .. } if *endpoint == nowhere), "{error}");
     assert!(error.to_string().contains(nowhere.as_str()) && error.to_string().contains("start it first"), "{error}");

@@ -289,7 +289,7 @@ fn bad_options_are_named() {
     assert_eq!(agents, "--agents is 4-2; expected a number or a range within 1-7");
     let copies = message(SynthOptions { copies: vec![Weather::Sunny], ..v2vdet(1, folder.path()) });
     assert_eq!(copies, "--copies is sunny; expected fog, snow or both");
-    let town = Some(RoadMapSource::OpenDrive("no/such/map.xodr".into()));
-    let missing = message(SynthOptions { town, ..v2vdet(1, folder.path()) });
+    let map = Some(RoadMapSource::OpenDrive("no/such/map.xodr".into()));
+    let missing = message(SynthOptions { map, ..v2vdet(1, folder.path()) });
     assert!(missing.contains("no/such/map.xodr"), "{missing}");
 }

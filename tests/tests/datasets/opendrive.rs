@@ -97,7 +97,7 @@ fn check_links(file: &str, graph: &LaneGraph) {
 
 #[test]
 #[ignore = "needs V2V_DATA"]
-fn maps_become_towns_with_free_lanes_the_same_every_time() {
+fn maps_become_models_with_free_lanes_the_same_every_time() {
     let folder = fixtures::data("opendrive");
     for expected in MAPS {
         let source = RoadMapSource::OpenDrive(folder.join(expected.file));

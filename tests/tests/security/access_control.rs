@@ -235,7 +235,7 @@ fn unknown_clients_are_refused() {
         // Without the bus's own check of endpoints: the same port, of TCP.
         let text = router.endpoint.as_str().replace("quic/", "tcp/");
         let mut options = BusOptions::client(text.parse().unwrap());
-        options.timeout = TRIED_FOR;
+        options.connect_timeout = TRIED_FOR;
         bus::open(&options)
     };
     std::thread::scope(|scope| {

@@ -83,7 +83,7 @@ fn unknown_clients(endpoint: &Endpoint, keys: &Path, expired: &Path, theirs: &Pa
             scope.spawn(move || assert!(unauthorised_peer(endpoint, authority, own).is_err(), "{what}"));
         }
         let plain = endpoint.as_str().replace("quic/", "tcp/").parse().unwrap();
-        let options = BusOptions { timeout: TRIED_FOR, ..BusOptions::client(plain) };
+        let options = BusOptions { connect_timeout: TRIED_FOR, ..BusOptions::client(plain) };
         assert!(bus::open(&options).is_err(), "plain TCP");
     });
 }

@@ -46,6 +46,7 @@ pub struct EndToEndConfig {
     /// Target of the regression.
     pub regresses: EndToEndKind,
     /// Name of the scene.
+    #[serde(rename = "town")]
     pub scene_name: String,
     /// Centre of the training positions, metres in the world.
     pub origin_m: [f64; 3],

@@ -14,6 +14,7 @@ pub(super) const MAX_PARAMETERS: i64 = 256_000_000;
 #[serde(deny_unknown_fields)]
 pub struct SceneHeadConfig {
     /// Name of the scene, in model cards and messages.
+    #[serde(rename = "town")]
     pub scene_name: String,
     /// SHA-256 of the encoder file whose features it was trained on.
     pub encoder_sha256: String,

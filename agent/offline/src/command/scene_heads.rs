@@ -14,6 +14,7 @@ use support::cli::BadInput;
 struct MapKey {
     #[serde(rename = "town")]
     name: String,
+    #[serde(rename = "town_seed")]
     map_seed: u64,
 }
 
@@ -60,7 +61,7 @@ pub(crate) fn head_of<'a>(heads: &'a [SceneHeadFile], scenario: &Scenario) -> Re
 /// Each head that scenes need, with those scenes, in the order of their first use.
 ///
 /// # Errors
-/// [`BadInput`] as [`head_of`], and when a folder has no scenario, or scenarios of several towns.
+/// [`BadInput`] as [`head_of`], and when a folder has no scenario, or scenarios of several maps.
 pub(crate) fn by_head<'a>(
     heads: &'a [SceneHeadFile],
     scenes: &[PathBuf],
@@ -75,7 +76,7 @@ pub(crate) fn by_head<'a>(
         let missing = || BadInput::new(format!("{}: there is no scenario in it", folder.display()));
         let &head = needed.first().ok_or_else(missing)?;
         if needed.iter().any(|other| *other != head) {
-            return Err(BadInput::new(format!("{}: scenarios of several towns", folder.display())));
+            return Err(BadInput::new(format!("{}: scenarios of several maps", folder.display())));
         }
         match groups.iter_mut().find(|(of, _)| *of == head) {
             Some((_, folders)) => folders.push(folder.clone()),
@@ -119,7 +120,7 @@ mod tests {
 
     #[test]
     fn the_town_of_a_generated_scene_is_read_from_its_protocol() {
-        let text = "description: x\ngenerator:\n  name: synth\n  town: 'town4'\n  map_seed: 5\nworld:\n  seed: 1\n";
+        let text = "description: x\ngenerator:\n  name: synth\n  town: 'town4'\n  town_seed: 5\nworld:\n  seed: 1\n";
         let file: ProtocolFile = serde_saphyr::from_str(text).unwrap();
         assert_eq!(file.generator, MapKey { name: "town4".into(), map_seed: 5 });
     }

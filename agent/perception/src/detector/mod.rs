@@ -241,14 +241,14 @@ impl Detector {
                 expected: self.sent_shape(),
             });
         }
-        let widened = self.decompressed(&Tensor::f_from_slice(values)?.f_view([1, expected, height, width])?)?;
+        let decompressed = self.decompressed(&Tensor::f_from_slice(values)?.f_view([1, expected, height, width])?)?;
         match (sent, &self.compressor) {
             // The expansion spreads the sent cells to their neighbours, and the bias everywhere.
             (Some(sent), Some(_)) => {
                 let sent = Tensor::f_from_slice(sent)?.f_to_kind(Kind::Float)?.f_view([1, 1, height, width])?;
-                Ok(widened.f_mul(&sent)?)
+                Ok(decompressed.f_mul(&sent)?)
             }
-            _ => Ok(widened),
+            _ => Ok(decompressed),
         }
     }
 

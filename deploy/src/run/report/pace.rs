@@ -76,10 +76,10 @@ fn published_s(record: &FrameRecord) -> Option<f64> {
 
 fn agents(processes: &[ProcessStats], ticks: u64) -> BTreeMap<String, AgentPace> {
     let mut agents = BTreeMap::<String, AgentPace>::new();
-    for books in processes {
-        let Some(cav) = vehicle_of(&books.process) else { continue };
+    for stats in processes {
+        let Some(cav) = vehicle_of(&stats.process) else { continue };
         let pace = agents.entry(cav.to_owned()).or_default();
-        pace.computed += sweeps(books);
+        pace.computed += sweeps(stats);
         pace.share = if ticks == 0 { 0.0 } else { pace.computed as f64 / ticks as f64 };
     }
     agents
@@ -91,6 +91,6 @@ fn vehicle_of(process: &ProcessId) -> Option<&str> {
 }
 
 /// Number of sweeps that an agent has computed.
-pub(super) fn sweeps(books: &ProcessStats) -> u64 {
-    books.stages.iter().find(|stage| stage.stage == WHOLE_SWEEP).map_or(0, |stage| stage.count)
+pub(super) fn sweeps(stats: &ProcessStats) -> u64 {
+    stats.stages.iter().find(|stage| stage.stage == WHOLE_SWEEP).map_or(0, |stage| stage.count)
 }

@@ -63,9 +63,9 @@ pub struct StreamBytes {
 /// Stages by kind of process, in the order of the data flow, then of their names.
 pub(super) fn stages(processes: &[ProcessStats]) -> Vec<StageTimes> {
     let mut all = BTreeMap::<(usize, String, String), StageTimes>::new();
-    for books in processes {
-        let (order, kind) = kind_of(books.process.as_str());
-        for stage in &books.stages {
+    for stats in processes {
+        let (order, kind) = kind_of(stats.process.as_str());
+        for stage in &stats.stages {
             let times = all.entry((order, kind.clone(), stage.stage.clone())).or_insert_with(|| StageTimes {
                 kind: kind.clone(),
                 processes: 0,
@@ -98,16 +98,16 @@ fn kind_of(process: &str) -> (usize, String) {
 /// CPU time and memory of every process, in the order of the data flow.
 pub(super) fn processes(processes: &[ProcessStats], pace: &Pace) -> Vec<ProcessResources> {
     let mut all = BTreeMap::<(usize, String), (ProcessResources, u64)>::new();
-    for books in processes {
-        let name = books.process.to_string();
+    for stats in processes {
+        let name = stats.process.to_string();
         let (order, kind) = kind_of(&name);
         let (sum, frames) = all.entry((order, name.clone())).or_insert_with(|| (nothing_of(name), 0));
         sum.instances += 1;
-        sum.cpu_s += books.usage.cpu_s;
-        sum.playing_cpu_s += (books.usage.cpu_s - books.cpu_before_s).max(0.0);
-        sum.peak_resident_bytes = sum.peak_resident_bytes.max(books.usage.peak_resident_bytes);
+        sum.cpu_s += stats.usage.cpu_s;
+        sum.playing_cpu_s += (stats.usage.cpu_s - stats.cpu_before_s).max(0.0);
+        sum.peak_resident_bytes = sum.peak_resident_bytes.max(stats.usage.peak_resident_bytes);
         *frames = match kind.as_str() {
-            "agent" => *frames + sweeps(books),
+            "agent" => *frames + sweeps(stats),
             "ego" => pace.answered,
             _ => pace.ticks,
         };
@@ -135,7 +135,7 @@ fn nothing_of(process: String) -> ProcessResources {
 /// Published bytes by stream, the largest first.
 pub(super) fn streams(processes: &[ProcessStats]) -> Vec<StreamBytes> {
     let mut sums = BTreeMap::<String, (u64, u64)>::new();
-    for traffic in processes.iter().flat_map(|books| &books.traffic) {
+    for traffic in processes.iter().flat_map(|stats| &stats.traffic) {
         let stream = match &traffic.topic {
             Topic::Stream { stream, .. } => stream.to_string(),
             Topic::Received { stream, .. } => format!("rx/{stream}"),

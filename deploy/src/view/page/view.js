@@ -98,7 +98,7 @@ function panels(frame) {
     ms(link.age_ms),
     ms(link.clock_ms),
     number(link.trust, 2),
-    link.is_fused ? "fused" : [[link.skipped || "silent", link.doubt].filter(Boolean).map(words).join(": "), "bad"],
+    link.is_fused ? "fused" : [[link.skipped || "silent", link.misbehaviour].filter(Boolean).map(words).join(": "), "bad"],
   ]), "Nobody sends to the ego.");
   stages(frame);
   table("messages", ["topic", "sent", "used", "dropped"], messageRows(frame.messages), "Nothing counted yet.");

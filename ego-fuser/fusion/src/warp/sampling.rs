@@ -43,8 +43,8 @@ impl Cells {
         Ok(Self { values: f64_tensor::cells(map)?, channels, height, width })
     }
 
-    /// The map `[C, h, w]` sampled bilinearly at `sampling_grid` `[h, w, 2]` (`grid_sampler`'s coordinates), and its validity
-    /// `[1, h, w]` by the nearest cell of `valid` `[H, W]`. Zeros beyond the edges, and where cells are invalid.
+    /// The map `[C, h, w]` sampled bilinearly at `sampling_grid` `[h, w, 2]` (`grid_sampler`'s coordinates), and its
+    /// validity `[1, h, w]` by the nearest cell of `valid` `[H, W]`. Zeros beyond the edges, and where cells are invalid.
     pub(super) fn read(
         &self,
         valid: &Tensor,
@@ -76,8 +76,8 @@ impl Cells {
         Ok((read, Tensor::f_from_slice(&reached)?.f_view([1, rows, columns])?))
     }
 
-    /// Raises `strongest` `[h * w, C]` to the map's values at `sampling_grid` `[h, w, 2]`, times `shares` `[h, w]`, where
-    /// those are larger, and where the nearest cell of `valid` `[H, W]` is valid.
+    /// Raises `strongest` `[h * w, C]` to the map's values at `sampling_grid` `[h, w, 2]`, times `shares` `[h, w]`,
+    /// where those are larger, and where the nearest cell of `valid` `[H, W]` is valid.
     pub(crate) fn raise(
         &self,
         strongest: &mut [f32],
@@ -96,8 +96,8 @@ impl Cells {
         self.channels
     }
 
-    /// Calls `see` with the features at each position of `sampling_grid` (`grid_sampler`'s coordinates, two per position)
-    /// where the nearest cell of `valid` `[H, W]` is valid.
+    /// Calls `see` with the features at each position of `sampling_grid` (`grid_sampler`'s coordinates, two per
+    /// position) where the nearest cell of `valid` `[H, W]` is valid.
     #[inline]
     pub(crate) fn for_each_valid(&self, valid: &[f32], sampling_grid: &[f32], mut see: impl FnMut(usize, &[f32])) {
         let mut shown = vec![0.0; self.channels];

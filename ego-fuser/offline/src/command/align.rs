@@ -47,7 +47,7 @@ pub(crate) struct Arguments {
     /// Weights of the detector, for detected boxes.
     #[arg(long, value_name = "FILE")]
     weights: Option<PathBuf>,
-    /// Drives through the same town with true poses from which the map of icp-map is built.
+    /// Drives through the same place with true poses from which the map of icp-map is built.
     #[arg(long, num_args = 1.., value_name = "DIR")]
     map: Vec<PathBuf>,
     /// Distance between two sweeps of the map, metres.

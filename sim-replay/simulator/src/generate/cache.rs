@@ -26,7 +26,9 @@ struct MadeWith {
 struct Generator {
     subset: String,
     seed: u64,
-    map_model: String,
+    #[serde(rename = "town")]
+    map: String,
+    #[serde(rename = "town_seed")]
     map_seed: u64,
     agents: usize,
     frames: usize,
@@ -55,9 +57,9 @@ pub fn are_kept(options: &SynthOptions) -> Result<bool, SynthError> {
         let folder = folder.to_owned();
         Err(SynthError::Kept { folder, setting, found, wanted })
     };
-    let towns: Vec<String> = sources(options).iter().map(RoadMapSource::name).collect();
+    let maps: Vec<String> = sources(options).iter().map(RoadMapSource::name).collect();
     for made in &scenarios {
-        let Generator { subset, seed, map_model, map_seed, agents, frames, period_seconds, weather, layout } = made;
+        let Generator { subset, seed, map, map_seed, agents, frames, period_seconds, weather, layout } = made;
         let settings = [
             ("subset", subset.clone(), options.subset.name().to_owned()),
             ("seed", seed.to_string(), options.seed.to_string()),
@@ -70,8 +72,8 @@ pub fn are_kept(options: &SynthOptions) -> Result<bool, SynthError> {
         if let Some((setting, found, wanted)) = settings.into_iter().find(|(_, found, wanted)| found != wanted) {
             return differs(setting, found, wanted);
         }
-        if !towns.contains(map_model) {
-            return differs("town", map_model.clone(), towns.join(" or "));
+        if !maps.contains(map) {
+            return differs("map", map.clone(), maps.join(" or "));
         }
         if !options.agents.contains(agents) {
             let wanted = format!("{} to {}", options.agents.start(), options.agents.end());
@@ -144,7 +146,7 @@ mod tests {
             (SynthOptions { agents: 3..=4, ..options.clone() }, "agents 2, not 3 to 4"),
             (SynthOptions { scenes: 3, ..options.clone() }, "scenarios 2, not 3"),
             (SynthOptions { weather: Weather::Fog, ..options.clone() }, "weather sunny, not fog"),
-            (SynthOptions { map_model: Some(RoadMapSource::Town1), ..options.clone() }, "map_model town4, not town1"),
+            (SynthOptions { map: Some(RoadMapSource::Town1), ..options.clone() }, "map town4, not town1"),
         ] {
             let problem = are_kept(&asked).unwrap_err().to_string();
             assert!(problem.contains(words) && problem.contains(&*out.to_string_lossy()), "{problem}");

@@ -31,7 +31,7 @@ world:
 /// of OpenCDA.
 pub(crate) fn protocol_yaml(options: &SynthOptions, spec: &SceneSpec, map_model: &MapModel) -> String {
     let SynthOptions { subset, seed, map_seed, weather, frames, period_s, .. } = options;
-    let (name, town_name, scene_seed, agents) = (&spec.name, &map_model.name, spec.seed, spec.agents);
+    let (name, map_name, scene_seed, agents) = (&spec.name, &map_model.name, spec.seed, spec.agents);
     let (subset, weather, version) = (subset.name(), weather.name(), env!("CARGO_PKG_VERSION"));
     // Without the entry the layout is OPV2V's.
     let layout = match options.layout {
@@ -49,8 +49,8 @@ generator:
   scenario: {name}
   seed: {seed}
   scene_seed: {scene_seed}
-  map_model: '{town_name}'
-  map_seed: {map_seed}
+  town: '{map_name}'
+  town_seed: {map_seed}
   agents: {agents}
   frames: {frames}
   period_seconds: {period_s}

@@ -37,7 +37,7 @@ impl Subset {
 /// Options of scene generation. The same options give the same files, byte for byte.
 ///
 /// By convention seeds 0 to 999 are for training and validation, and 1000 and above for measuring only, so that no
-/// measured scene was ever trained on. The town seed is the same for all: it determines the map.
+/// measured scene was ever trained on. The map seed is the same for all: it determines the map.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SynthOptions {
     /// Subset: number of agents and default maps.
@@ -49,7 +49,7 @@ pub struct SynthOptions {
     /// Layout of the files.
     pub layout: SceneLayout,
     /// The map; by default that of the subset, for V2VDet both in turn.
-    pub map_model: Option<RoadMapSource>,
+    pub map: Option<RoadMapSource>,
     /// Determines all static objects.
     pub map_seed: u64,
     /// Traversals of a localization subset: one scenario each.
@@ -81,7 +81,7 @@ impl SynthOptions {
             seed,
             out,
             layout: SceneLayout::Opv2v,
-            map_model: None,
+            map: None,
             map_seed: 0,
             traversals: 1,
             scenes: 1,

@@ -83,8 +83,8 @@ pub fn generate(options: &SynthOptions, progress: &(dyn Fn(u64) + Sync)) -> Resu
 
 /// The maps of the scenarios, used in turn.
 pub(super) fn sources(options: &SynthOptions) -> Vec<RoadMapSource> {
-    match (&options.map_model, options.subset) {
-        (Some(map_model), _) => vec![map_model.clone()],
+    match (&options.map, options.subset) {
+        (Some(map), _) => vec![map.clone()],
         (None, Subset::Town1loc) => vec![RoadMapSource::Town1],
         (None, Subset::Town4loc) => vec![RoadMapSource::Town4],
         (None, Subset::V2vdet) => vec![RoadMapSource::Town1, RoadMapSource::Town4],

@@ -1,7 +1,8 @@
 //! Static scene: roads, ground, buildings and street furniture.
 //!
-//! A [`MapModel`] is made from a source (one of two procedural kinds, or an OpenDRIVE map) and a seed; the same source and
-//! seed give the same result, byte for byte. Routes, traffic and parked cars are generated later from another seed.
+//! A [`MapModel`] is made from a source (one of two procedural kinds, or an OpenDRIVE map) and a seed; the same
+//! source and seed give the same result, byte for byte. Routes, traffic and parked cars are generated later from
+//! another seed.
 //!
 //! # Frames and units
 //! World frame of the map: right-handed, x east, y north, z up, metres; yaw turns x towards y.

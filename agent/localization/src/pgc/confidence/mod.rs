@@ -65,6 +65,7 @@ pub struct ConfidenceModel {
     /// Decreasing function from the expected logarithm of the error to sigma.
     pub sigma: MonotoneMap,
     /// Threshold: poses of a lower sigma are rejected.
+    #[serde(rename = "withhold_below")]
     pub reject_below: f64,
 }
 

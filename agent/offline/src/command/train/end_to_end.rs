@@ -19,7 +19,7 @@ pub(crate) struct Args {
     #[arg(long, value_enum)]
     regresses: Regresses,
     /// Name of the scene, for messages and the model card.
-    #[arg(long, default_value = "town")]
+    #[arg(long, default_value = "scene")]
     scene_name: String,
     /// Weights of a frozen encoder [default: the encoder is trained from random weights with the rest].
     #[arg(long, value_name = "FILE")]

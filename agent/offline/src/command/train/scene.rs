@@ -30,7 +30,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "FILE")]
     encoder: PathBuf,
     /// Name of the scene, for messages and the model card.
-    #[arg(long, default_value = "town")]
+    #[arg(long, default_value = "scene")]
     scene_name: String,
     /// Clusters of sensor positions that a sweep is classified into.
     #[arg(long, default_value_t = 50)]

@@ -133,8 +133,8 @@ pub(crate) fn moved(ego_from_cav: &Pose, delta: &[f64]) -> Pose {
     Pose::from_xyz_yaw([x + delta[0], y + delta[1], z], ego_from_cav.yaw_rad() + delta[2])
 }
 
-/// Maps `[N, C, H, W]` and their validity `[N, 1, H, W]`, sampled at `sampling_grid`. Cells beyond their edges are invalid;
-/// the values of invalid cells are not zero.
+/// Maps `[N, C, H, W]` and their validity `[N, 1, H, W]`, sampled at `sampling_grid`. Cells beyond their edges are
+/// invalid; the values of invalid cells are not zero.
 pub(crate) fn resample(maps: &Tensor, valid: &Tensor, sampling_grid: &Tensor) -> Result<(Tensor, Tensor), TchError> {
     let valid =
         valid.f_grid_sampler(&sampling_grid.f_detach()?, NEAREST, PADDING_ZEROS, false)?.f_to_kind(Kind::Float)?;

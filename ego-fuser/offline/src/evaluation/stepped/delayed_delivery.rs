@@ -1,5 +1,5 @@
-//! Delayed delivery: messages between the agents and an ego in simulation time, handed over ahead, submitted to the link
-//! in order of time, and counted.
+//! Delayed delivery: messages between the agents and an ego in simulation time, handed over ahead, submitted to the
+//! link in order of time, and counted.
 
 use std::collections::{BTreeMap, BTreeSet};
 
