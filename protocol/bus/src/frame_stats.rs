@@ -30,7 +30,8 @@ impl FrameStats {
         if let Some(latency_s) = latency.map(|latency| latency.as_secs_f64()) {
             self.latency_sum_s += latency_s;
             self.latencies += 1;
-            self.buckets[LATENCY_BUCKETS_S.partition_point(|end| *end < latency_s)] += 1;
+            let bucket = LATENCY_BUCKETS_S.partition_point(|end| *end < latency_s);
+            self.buckets.iter_mut().skip(bucket).take(1).for_each(|count| *count += 1);
         }
     }
 
