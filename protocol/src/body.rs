@@ -146,7 +146,10 @@ impl<'a> PayloadReader<'a> {
     /// [`WireError::Shape`] when the length does not match the shape.
     pub(crate) fn read_body(&mut self, len: u64, shape: BodyShape, max_abs: f32) -> Result<(Body, bool), WireError> {
         shape.check(len)?;
-        let len = len as usize;
+        let len = usize::try_from(len).map_err(|_| {
+            let max = usize::MAX as u64;
+            WireError::Limit { what: "body bytes", max, found: len }
+        })?;
         Ok(match shape {
             BodyShape::Empty => (Body::Empty, true),
             BodyShape::Bytes { .. } => (Body::Bytes(self.read_bytes(len)), true),
@@ -200,12 +203,13 @@ impl<'a> PayloadReader<'a> {
 
     /// Fills `bytes`; `false` when the pieces end before.
     fn fill(&mut self, bytes: &mut [u8]) -> bool {
-        let mut filled = 0;
-        while filled < bytes.len() {
-            let Some(run) = self.next_run(bytes.len() - filled) else { return false };
+        let mut left = bytes;
+        while !left.is_empty() {
+            let Some(run) = self.next_run(left.len()) else { return false };
             self.crc.update(run);
-            bytes[filled..filled + run.len()].copy_from_slice(run);
-            filled += run.len();
+            let Some((filled, rest)) = left.split_at_mut_checked(run.len()) else { return false };
+            filled.copy_from_slice(run);
+            left = rest;
         }
         true
     }
@@ -256,12 +260,12 @@ pub(crate) fn check_values(what: &'static str, values: &[f32], max_abs: f32) -> 
         return Ok(());
     }
     let headroom = headroom(max_abs);
-    match values.iter().position(|value| excess_over(headroom, *value) < 0) {
+    match values.iter().enumerate().find(|(_, value)| excess_over(headroom, **value) < 0) {
         None => Ok(()),
-        Some(index) => Err(WireError::Value {
+        Some((index, value)) => Err(WireError::Value {
             what,
             index,
-            value: f64::from(values[index]),
+            value: f64::from(*value),
             min: f64::from(-max_abs),
             max: f64::from(max_abs),
         }),

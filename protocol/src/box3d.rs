@@ -20,16 +20,17 @@ impl Box3d {
     /// Corners in metres: bottom face `(+l, -w) (+l, +w) (-l, +w) (-l, -w)`, then the top face in the same order.
     #[must_use]
     pub fn corners(&self) -> [[f64; 3]; 8] {
-        const SIGNS: [(f64, f64); 4] = [(1.0, -1.0), (1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0)];
+        let [a, b, c, d] = [(1.0, -1.0), (1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0)];
         let (sin, cos) = self.heading_rad.sin_cos();
         let [x, y, z] = self.center_m;
         let [half_l, half_w, half_h] = self.size_m.map(|size| size / 2.0);
-        std::array::from_fn(|corner| {
-            let (sign_l, sign_w) = SIGNS[corner % 4];
+        let corner = |(sign_l, sign_w): (f64, f64), h: f64| {
             let (l, w) = (sign_l * half_l, sign_w * half_w);
-            let h = if corner < 4 { -half_h } else { half_h };
             [x + cos * l - sin * w, y + sin * l + cos * w, z + h]
-        })
+        };
+        let [bottom, top] = [-half_h, half_h].map(|h| [a, b, c, d].map(|signs| corner(signs, h)));
+        let ([a, b, c, d], [e, f, g, h]) = (bottom, top);
+        [a, b, c, d, e, f, g, h]
     }
 
     /// The same box in a world whose y axis points the other way.

@@ -70,6 +70,11 @@ pub struct Header {
 impl Header {
     /// The header as it is transmitted.
     #[must_use]
+    #[expect(
+        clippy::indexing_slicing,
+        clippy::cast_possible_truncation,
+        reason = "offsets are constants, and an id has at most 32 bytes"
+    )]
     pub fn to_bytes(&self) -> [u8; HEADER_LEN] {
         // Destructured in full, so that a new field stops the build here.
         let Self { kind, stamp, metadata_len, body_len, payload_crc } = self;
@@ -140,6 +145,7 @@ impl Header {
     }
 }
 
+#[expect(clippy::indexing_slicing, reason = "offsets are constants within the header")]
 fn take<const N: usize>(bytes: &[u8; HEADER_LEN], offset: usize) -> [u8; N] {
     std::array::from_fn(|index| bytes[offset + index])
 }

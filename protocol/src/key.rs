@@ -168,7 +168,7 @@ impl KeyExpr {
         Self(format!("{KEY_ROOT}/{run}/**"))
     }
 
-    /// Key that no process ever declares: `v2v/<run>/nobody`. A query on it reaches the router only.
+    /// Key that no process ever declares: `v2v/<run>/undeclared`. A query on it reaches the router only.
     #[must_use]
     pub fn none(run: &RunId) -> Self {
         Self(format!("{KEY_ROOT}/{run}/{UNDECLARED}"))

@@ -76,6 +76,10 @@
 //! - BEV feature maps are `[C, H, W]`: the row grows with y, the column with x.
 //! - Times are nanoseconds: capture times on the clock of the scene, everything else on the Unix clock.
 
+// This crate reads what other processes and people wrote: an index or a cast that does not fit is an error there, not
+// a panic or another number.
+#![cfg_attr(not(test), deny(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::indexing_slicing))]
+
 pub mod access;
 mod bev;
 mod body;
@@ -121,7 +125,8 @@ pub use limits::Limits;
 pub use message::{
     AgentTruth, Bev, Boxes, Control, Descriptor, Detections, DetectionsReport, EgoMotion, FusedNeighbour, Gnss,
     GnssSource, Kind, Lidar, Message, ModelHash, NeighbourState, NoPoseReason, Pace, Payload, PlanarCovariance, Points,
-    PoseEstimate, Radar, SkippedNeighbour, StageSummary, StageTiming, Stats, TopicCount, TrueObject, Truth,
+    PoseEstimate, ProcessUsage, Radar, SkippedNeighbour, StageSummary, StageTiming, Stats, TopicCount, TopicTraffic,
+    TrueObject, Truth,
 };
 pub use misbehaviour_reason::MisbehaviourReason;
 pub use point_cloud::{Handedness, PointCloud};

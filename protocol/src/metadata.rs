@@ -24,10 +24,10 @@ const CONFIG: Configuration<LittleEndian, Varint, Limit<HARD_LIMIT>> = bincode::
 pub(crate) fn append<T: Serialize>(kind: Kind, metadata: &T, head: &mut Vec<u8>) -> Result<u32, WireError> {
     let len = bincode::serde::encode_into_std_write(metadata, head, CONFIG)
         .map_err(|error| WireError::Metadata { kind, detail: error.to_string() })?;
-    if len > HARD_LIMIT {
-        return Err(WireError::Limit { what: "metadata bytes", max: HARD_LIMIT as u64, found: len as u64 });
+    match u32::try_from(len) {
+        Ok(bytes) if len <= HARD_LIMIT => Ok(bytes),
+        _ => Err(WireError::Limit { what: "metadata bytes", max: HARD_LIMIT as u64, found: len as u64 }),
     }
-    Ok(len as u32)
 }
 
 /// Reads metadata that fill `bytes` completely.

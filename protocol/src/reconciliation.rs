@@ -78,7 +78,7 @@ impl Reconciliation {
         if missing != 0 {
             let Account { topic, to } = account.clone();
             // Counters of real runs are far from the ends of the range; hostile ones may be clamped.
-            let missing = missing.clamp(i64::MIN.into(), i64::MAX.into()) as i64;
+            let missing = i64::try_from(missing).unwrap_or(if missing < 0 { i64::MIN } else { i64::MAX });
             self.discrepancies.push(Discrepancy { topic, to, missing, counts });
         }
     }

@@ -1,5 +1,10 @@
 //! Exact overlap of boxes seen from above, by clipping of convex polygons.
 
+#![expect(
+    clippy::indexing_slicing,
+    reason = "axes and corners of arrays of fixed size; `len` never exceeds MAX_CORNERS"
+)]
+
 /// Corners of a footprint, metres, in order around it.
 pub type Footprint = [[f64; 2]; 4];
 
@@ -70,6 +75,7 @@ impl Polygon {
 
     /// True if the IoU is above `threshold`; decided without clipping if bounds and areas suffice.
     #[must_use]
+    #[expect(clippy::cast_possible_truncation, reason = "compared in f32")]
     pub fn overlaps_more_than(&self, other: &Self, threshold: f64) -> bool {
         let most = self.bounds_overlap(other).min(self.area).min(other.area);
         // IoU rises with the intersection, so the polygons cannot exceed the bound.

@@ -58,7 +58,7 @@ pub fn encode<M: Payload>(stamp: &Stamp, message: M) -> Result<Encoded, WireErro
     let mut head = vec![0; HEADER_LEN];
     let metadata_len = metadata::append(M::KIND, &metadata, &mut head)?;
     let mut crc = Hasher::new();
-    crc.update(&head[HEADER_LEN..]);
+    crc.update(head.get(HEADER_LEN..).unwrap_or_default());
     crc.update(body.as_bytes());
     let header = Header {
         kind: M::KIND,
@@ -67,7 +67,9 @@ pub fn encode<M: Payload>(stamp: &Stamp, message: M) -> Result<Encoded, WireErro
         body_len: body.len() as u64,
         payload_crc: crc.finalize(),
     };
-    head[..HEADER_LEN].copy_from_slice(&header.to_bytes());
+    if let Some(begin) = head.first_chunk_mut() {
+        *begin = header.to_bytes();
+    }
     Ok(Encoded { head, body })
 }
 
@@ -97,16 +99,17 @@ impl MessageVisitor for Encoder<'_> {
 /// [`WireError`] when there is no header of this version.
 pub fn decode_header<'a>(pieces: impl IntoIterator<Item = &'a [u8]>) -> Result<Header, WireError> {
     let mut bytes = [0; HEADER_LEN];
-    let mut filled = 0;
+    let mut left = bytes.as_mut_slice();
     for piece in pieces {
-        let take = piece.len().min(HEADER_LEN - filled);
-        bytes[filled..filled + take].copy_from_slice(&piece[..take]);
-        filled += take;
-        if filled == HEADER_LEN {
+        let (filled, rest) = left.split_at_mut(piece.len().min(left.len()));
+        filled.iter_mut().zip(piece).for_each(|(byte, from)| *byte = *from);
+        left = rest;
+        if left.is_empty() {
             return Header::from_bytes(&bytes);
         }
     }
-    Err(WireError::Truncated { expected: HEADER_LEN as u64, found: filled as u64 })
+    let found = (HEADER_LEN - left.len()) as u64;
+    Err(WireError::Truncated { expected: HEADER_LEN as u64, found })
 }
 
 /// Decodes a message of a known kind from its pieces.

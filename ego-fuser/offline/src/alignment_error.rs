@@ -6,8 +6,8 @@
 use std::f64::consts::TAU;
 
 use dataset::{LoadOptions, ReadError, Scenario};
-use perception::detector::{Detector, DetectorError};
-use perception::weights::{Weights, WeightsError};
+use perception::detector::Detector;
+use perception::weights::Weights;
 use protocol::{PointCloud, Pose};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -15,36 +15,20 @@ use serde::Serialize;
 use support::statistics;
 use tch::{Kind, Tensor, no_grad};
 
-use ego_fuser::ego::Ego;
-use fusion::method::{Method, UnknownMethod};
-use fusion::model::{FusionStage, METHOD_KEY, StageError};
-use fusion::warp::WarpError;
+use ego_fuser::ego::{Ego, EgoError};
+use fusion::method::Method;
+use fusion::model::{FusionStage, METHOD_KEY};
 use fusion::{MapMetadata, ReceivedMaps};
 
 /// Reason why nothing is measured.
 #[derive(Debug, thiserror::Error)]
 pub enum AlignmentMeterError {
-    /// The weights are not readable.
+    /// The weights are not usable, or the network reported an error.
     #[error(transparent)]
-    Weights(#[from] WeightsError),
-    /// The detector reported an error.
-    #[error(transparent)]
-    Detector(#[from] DetectorError),
-    /// The weights name a method that is not known.
-    #[error(transparent)]
-    Method(#[from] UnknownMethod),
-    /// The fusion does not fit the weights.
-    #[error(transparent)]
-    Fusion(#[from] StageError),
+    Ego(#[from] EgoError),
     /// A frame cannot be read.
     #[error(transparent)]
     Read(#[from] ReadError),
-    /// Maps cannot be aligned.
-    #[error(transparent)]
-    Warp(#[from] WarpError),
-    /// The tensor library reported an error.
-    #[error("alignment error: {0}")]
-    Torch(#[from] tch::TchError),
     /// The fusion has no alignment to measure.
     #[error("the fusion of these weights has no alignment of its own")]
     NoAlignment,
@@ -91,8 +75,8 @@ impl AlignmentMeter {
     /// Reads the weights.
     ///
     /// # Errors
-    /// [`AlignmentMeterError`] names the file and what is wrong with it.
-    pub fn load(weights: &Weights) -> Result<Self, AlignmentMeterError> {
+    /// [`EgoError`] names the file and what is wrong with it.
+    pub fn load(weights: &Weights) -> Result<Self, EgoError> {
         let method = weights.metadata(METHOD_KEY).unwrap_or(Method::NONE.name()).parse()?;
         let detector = Detector::from_weights(weights, &weights.config()?)?;
         let fusion = FusionStage::from_weights(weights, method, detector.config())?;
@@ -137,7 +121,7 @@ impl AlignmentMeter {
             let ego_from_cav = world_from_ego.from_world(&world_from_cav);
             let [x, y, _] = ego_from_cav.translation_m;
             if x.hypot(y) <= Ego::COMM_RANGE_M {
-                let maps = Tensor::f_cat(&[&own, &self.map(&frame.points)?], 0)?;
+                let maps = Tensor::f_cat(&[&own, &self.map(&frame.points)?], 0).map_err(EgoError::from)?;
                 pairs.push(Pair { maps, ego_from_cav });
             }
         }
@@ -145,9 +129,9 @@ impl AlignmentMeter {
     }
 
     /// The map `[1, C, H, W]` of a sweep as other vehicles receive it.
-    fn map(&mut self, points: &PointCloud) -> Result<Tensor, DetectorError> {
+    fn map(&mut self, points: &PointCloud) -> Result<Tensor, EgoError> {
         let encoded = self.detector.encode(points)?.features;
-        self.detector.through_compressor(&encoded)
+        Ok(self.detector.through_compressor(&encoded)?)
     }
 
     /// Errors of a pair with an offset, before and after: metres and degrees.
@@ -155,16 +139,21 @@ impl AlignmentMeter {
         let (sin, cos) = rng.random_range(0.0..TAU).sin_cos();
         let turn_rad = offset.turn_deg.to_radians() * if rng.random_bool(0.5) { 1.0 } else { -1.0 };
         let off = moved(&pair.ego_from_cav, [offset.shift_m * cos, offset.shift_m * sin, turn_rad]);
-        let facts = [MapMetadata::fresh(0, Pose::IDENTITY), MapMetadata::fresh(1, off)];
+        let correction = self.correction(&pair.maps, off)?.ok_or(AlignmentMeterError::NoAlignment)?;
+        let corrected = moved(&off, correction);
+        Ok([error(&pair.ego_from_cav, &off), error(&pair.ego_from_cav, &corrected)])
+    }
+
+    /// The method's correction of the pose of the second of two maps: x and y, metres, and heading, radians.
+    fn correction(&self, maps: &Tensor, reported: Pose) -> Result<Option<[f64; 3]>, EgoError> {
+        let facts = [MapMetadata::fresh(0, Pose::IDENTITY), MapMetadata::fresh(1, reported)];
         let fused = no_grad(|| {
-            let received = ReceivedMaps::new(pair.maps.shallow_clone(), None);
+            let received = ReceivedMaps::new(maps.shallow_clone(), None);
             self.fusion.fuse(&self.fusion.align(&received, &facts)?)
         })?;
-        let correction = fused.corrections.ok_or(AlignmentMeterError::NoAlignment)?;
+        let Some(correction) = fused.corrections else { return Ok(None) };
         let values: Vec<f64> = Vec::try_from(correction.f_to_kind(Kind::Double)?.f_view([-1])?)?;
-        let [dx, dy, theta] = [0, 1, 2].map(|index| values[index]);
-        let corrected = moved(&off, [dx, dy, theta]);
-        Ok([error(&pair.ego_from_cav, &off), error(&pair.ego_from_cav, &corrected)])
+        Ok(values.first_chunk().copied())
     }
 }
 

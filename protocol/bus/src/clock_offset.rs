@@ -31,7 +31,8 @@ impl ClockOffset {
             self.shortest = [i64::MAX, self.shortest[0]];
         }
         let took = i128::from(arrived_nanos) - i128::from(sent_nanos);
-        self.shortest[0] = self.shortest[0].min(took.clamp(i64::MIN.into(), i64::MAX.into()) as i64);
+        let took = i64::try_from(took).unwrap_or(if took < 0 { i64::MIN } else { i64::MAX });
+        self.shortest[0] = self.shortest[0].min(took);
         let offset_s = self.seconds();
         let half = if self.was_far { 0.5 } else { 1.0 };
         let is_far = offset_s > AHEAD_S * half || offset_s < -BEHIND_S * half;

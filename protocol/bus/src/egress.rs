@@ -82,8 +82,8 @@ fn rule(id: &str, filter: &Value, congestion_control: &str, only: &Value) -> Val
         "qos": filter,
         "overwrite": {"congestion_control": congestion_control},
     });
-    for (key, value) in only.as_object().into_iter().flatten() {
-        rule[key] = value.clone();
+    if let (Some(rule), Some(only)) = (rule.as_object_mut(), only.as_object()) {
+        rule.extend(only.clone());
     }
     rule
 }

@@ -14,6 +14,10 @@
 //! The crate is not async: zenoh has its own runtimes, and a `put` that waits for a slow network must not block an
 //! executor. Inside tokio it needs the multi-thread runtime.
 
+// This crate reads what other processes and people wrote: an index or a cast that does not fit is an error there, not
+// a panic or another number.
+#![cfg_attr(not(test), deny(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::indexing_slicing))]
+
 mod access_control;
 mod args;
 mod batch_scheduling;
@@ -27,6 +31,7 @@ mod egress;
 mod endpoint;
 mod error;
 mod flush_barrier;
+mod frame_stats;
 mod handshake_failures;
 mod inbox_limits;
 mod liveliness;
@@ -37,6 +42,7 @@ mod metrics;
 mod passive_subscriber;
 mod plain_tcp;
 mod process_config;
+mod process_usage;
 mod publisher;
 mod readiness;
 mod rejection_log;
@@ -55,15 +61,17 @@ pub use bus::{Bus, Identity};
 pub use credentials::{AUTHORITY_FILE, CERTIFICATE_FILE, Credentials, KEY_FILE, MEMBERS_FILE, ROUTER};
 pub use endpoint::Endpoint;
 pub use error::BusError;
+pub use frame_stats::FrameStats;
 pub use inbox_limits::InboxLimits;
 pub use liveliness::{LivelinessEvent, LivelinessSubscription, LivelinessToken, present};
 pub use membership::Membership;
 pub use message_stats::{MessageStats, PeerSummary, SharedMemoryUse};
 pub use passive_subscriber::{PassiveSubscriber, RawMessage};
 pub use process_config::{Configured, ProcessConfig, minimal};
+pub use process_usage::{process_cpu_s, process_usage};
 pub use publisher::{Overflow, Publisher, PublisherOptions, unix_nanos};
 pub use readiness::{Barrier, NotReady, Route, RouteError, RoutesReady, process_id};
 pub use rejection_log::{Rejection, RejectionLog};
-pub use session::{BusOptions, SharedMemory, open};
+pub use session::{BusOptions, Role as SessionRole, SharedMemory, open};
 pub use subscriber::{Arrival, Event, Inbox, Subscription};
 pub use watchdog::Heartbeat;

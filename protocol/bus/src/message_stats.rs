@@ -5,11 +5,14 @@ use std::fmt;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use protocol::{Account, CavId, DropReason, Ledger, Limits, ProcessId, RateReason, StageSummary, Topic, WireError};
+use protocol::{
+    Account, CavId, DropReason, Ledger, Limits, ProcessId, RateReason, StageSummary, Topic, TopicTraffic, WireError,
+};
 
 use support::statistics::{quantile, sorted};
 
 use super::clock_offset::ClockOffset;
+use super::frame_stats::FrameStats;
 
 /// Maximum number of accounts of one process, equal to the limit of the ledger's receivers.
 const MAX_ACCOUNTS: usize = Limits::DEFAULT.max_entries;
@@ -58,6 +61,9 @@ struct State {
     // Malformed messages, of any kind of topic.
     rejections: BTreeMap<Topic, u64>,
     stages: BTreeMap<String, Timings>,
+    // Published messages and their bytes.
+    traffic: BTreeMap<Topic, (u64, u64)>,
+    frames: FrameStats,
     peers: BTreeMap<CavId, Peer>,
     shared: BTreeMap<SharedMemoryUse, u64>,
     is_full: bool,
@@ -264,12 +270,49 @@ impl MessageStats {
         let Some(timings) = state.stages.get_mut(stage) else { return };
         timings.count += 1;
         timings.sum = timings.sum.saturating_add(time);
-        timings.buckets[BUCKETS_S.partition_point(|end| *end < time.as_secs_f64())] += 1;
+        let bucket = BUCKETS_S.partition_point(|end| *end < time.as_secs_f64());
+        if let Some(count) = timings.buckets.get_mut(bucket) {
+            *count += 1;
+        }
         timings.max = timings.max.max(time);
         if timings.last.len() == KEPT_TIMINGS {
             timings.last.pop_front();
         }
         timings.last.push_back(time);
+    }
+
+    /// Counts the bytes of a message that the network has taken.
+    pub(super) fn published(&self, topic: &Topic, bytes: usize) {
+        let mut state = self.lock();
+        if state.traffic.len() < MAX_ACCOUNTS || state.traffic.contains_key(topic) {
+            let (messages, sum) = state.traffic.entry(topic.clone()).or_default();
+            (*messages, *sum) = (*messages + 1, sum.saturating_add(bytes as u64));
+        }
+    }
+
+    /// Published messages and bytes so far, by topic.
+    #[must_use]
+    pub fn traffic(&self) -> Vec<TopicTraffic> {
+        let of =
+            |(topic, &(messages, bytes)): (&Topic, &(u64, u64))| TopicTraffic { topic: topic.clone(), messages, bytes };
+        self.lock().traffic.iter().map(of).collect()
+    }
+
+    /// Counts a tick of the scene.
+    pub fn tick(&self) {
+        self.lock().frames.ticks += 1;
+    }
+
+    /// Counts the detections of a frame; `latency` is the time from the publication of the tick to that of its
+    /// detections, `None` if unknown here.
+    pub fn answered(&self, latency: Option<Duration>, fused_neighbours: usize) {
+        self.lock().frames.answer(latency, fused_neighbours);
+    }
+
+    /// Frames so far, from end to end.
+    #[must_use]
+    pub fn frames(&self) -> FrameStats {
+        self.lock().frames.clone()
     }
 
     /// Current ledger. Messages submitted and not handed over, or arrived and not yet used or dropped, are in flight.

@@ -285,10 +285,12 @@ impl Sender {
             Ok(bytes) => {
                 self.stats.timed("encode", began.elapsed());
                 self.sequence += 1;
-                let is_large = bytes.len() >= SMALL_BYTES;
+                let length = bytes.len();
+                let is_large = length >= SMALL_BYTES;
                 if self.put(bytes) {
                     self.handed_over = self.handed_over.wrapping_add(1);
                     self.stats.delivered(&self.topic);
+                    self.stats.published(&self.topic, length);
                     if is_large && self.is_one_at_a_time {
                         self.receipt.wait(LONGEST_MESSAGE);
                     }

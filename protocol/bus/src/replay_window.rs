@@ -114,7 +114,7 @@ impl Senders {
 
     /// A message of a previous epoch: a replay, a message in transit at the restart, or a second sender.
     fn admit_previous_epoch(&mut self, place: usize, sequence: u64, now: Instant) -> Option<DropReason> {
-        let sender = &mut self.former[place];
+        let sender = self.former.get_mut(place)?;
         if let Some(repeated) = sender.numbers.note(sequence) {
             return Some(repeated);
         }

@@ -256,8 +256,9 @@ pub fn fetch(address: SocketAddr, path: &str) -> io::Result<(String, Vec<u8>)> {
     let mut answer = Vec::new();
     connection.read_to_end(&mut answer)?;
     let end = answer.windows(4).position(|bytes| bytes == b"\r\n\r\n").ok_or(io::ErrorKind::InvalidData)?;
-    let status = String::from_utf8_lossy(&answer[..end]).lines().next().unwrap_or_default().to_owned();
-    Ok((status, answer[end + 4..].to_vec()))
+    let status =
+        String::from_utf8_lossy(answer.get(..end).unwrap_or_default()).lines().next().unwrap_or_default().to_owned();
+    Ok((status, answer.get(end + 4..).unwrap_or_default().to_vec()))
 }
 
 #[cfg(test)]

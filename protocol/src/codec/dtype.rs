@@ -49,7 +49,7 @@ pub(super) fn scales(values: &[f32], channels: usize) -> Vec<f32> {
     let scale = |channel: &[f32]| {
         // Without the sign, bit patterns have the order of the numbers, and integers have a vectorised maximum.
         let largest = channel.iter().fold(0i32, |largest, value| largest.max(value.abs().to_bits() as i32));
-        let largest = f32::from_bits(largest as u32);
+        let largest = f32::from_bits(largest.cast_unsigned());
         let scale = largest / I8_STEPS;
         // The inverse of a subnormal scale would be infinite.
         if scale.is_normal() { scale } else { 0.0 }
@@ -61,6 +61,7 @@ pub(super) fn scales(values: &[f32], channels: usize) -> Vec<f32> {
 ///
 /// # Errors
 /// [`WireError::Value`] when a value is beyond the range of half precision.
+#[expect(clippy::cast_possible_truncation, reason = "the low byte of a sum with ROUND is the rounded value")]
 pub(super) fn append(dtype: Dtype, values: &[f32], scales: &[f32], bytes: &mut Vec<u8>) -> Result<(), WireError> {
     match dtype {
         Dtype::F32 => bytes.extend_from_slice(cast_slice(values)),
@@ -76,6 +77,7 @@ pub(super) fn append(dtype: Dtype, values: &[f32], scales: &[f32], bytes: &mut V
     Ok(())
 }
 
+#[expect(clippy::indexing_slicing, reason = "a chunk has at most BLOCK values, and its positions are below its length")]
 fn append_f16(values: &[f32], bytes: &mut Vec<u8>) -> Result<(), WireError> {
     let max = f32::from(f16::MAX);
     let mut block = [f16::ZERO; BLOCK];
@@ -97,9 +99,9 @@ fn append_f16(values: &[f32], bytes: &mut Vec<u8>) -> Result<(), WireError> {
 ///
 /// # Errors
 /// [`WireError::Value`] when a scale is not a finite number of at least zero.
+#[expect(clippy::indexing_slicing, reason = "a chunk has at most 2 * BLOCK bytes")]
 pub(super) fn read(dtype: Dtype, scales: &[u8], bytes: &[u8], selected: usize) -> Result<Vec<f32>, WireError> {
-    let count = bytes.len() / dtype.size() as usize;
-    let mut values = Vec::with_capacity(count);
+    let mut values = Vec::with_capacity(usize::try_from(bytes.len() as u64 / dtype.size()).unwrap_or_default());
     match dtype {
         Dtype::F32 => values.extend(bytes.chunks_exact(4).map(bytemuck::pod_read_unaligned::<f32>)),
         Dtype::F16 => {
@@ -127,10 +129,10 @@ pub(super) fn read(dtype: Dtype, scales: &[u8], bytes: &[u8], selected: usize) -
 fn read_scales(bytes: &[u8]) -> Result<Vec<f32>, WireError> {
     let mut scales = vec![0f32; bytes.len() / 4];
     cast_slice_mut(&mut scales).copy_from_slice(bytes);
-    match scales.iter().position(|scale| !(scale.is_finite() && *scale >= 0.0)) {
+    match scales.iter().enumerate().find(|(_, scale)| !(scale.is_finite() && **scale >= 0.0)) {
         None => Ok(scales),
-        Some(index) => {
-            let value = scales[index].into();
+        Some((index, scale)) => {
+            let value = (*scale).into();
             Err(WireError::Value { what: "channel scale", index, value, min: 0.0, max: f32::MAX.into() })
         }
     }

@@ -90,6 +90,7 @@ impl ConfidenceGate {
 }
 
 impl Smoothing {
+    #[expect(clippy::indexing_slicing, reason = "the window of a row is cut at the first and the last row")]
     fn smooth(&self, values: &[f32], grid: &BevGrid) -> Result<Vec<f32>, WireError> {
         let weights = self.weights()?;
         let width = grid.width as usize;
@@ -112,6 +113,7 @@ impl Smoothing {
     }
 
     /// One dimension of the separable window.
+    #[expect(clippy::cast_possible_truncation, reason = "weights are rounded to f32")]
     fn weights(&self) -> Result<Vec<f32>, WireError> {
         let Self { kernel, sigma } = *self;
         let refuse = |what, value, max| Err(WireError::Value { what, index: 0, value, min: 1e-3, max });
@@ -129,6 +131,7 @@ impl Smoothing {
 }
 
 /// Convolution of `values` with `weights`, zeros outside.
+#[expect(clippy::indexing_slicing, reason = "the window of a cell is cut at both ends of the row")]
 fn convolve(values: &[f32], weights: &[f32], smoothed: &mut [f32]) {
     let half = weights.len() / 2;
     for (cell, smoothed) in smoothed.iter_mut().enumerate() {

@@ -23,6 +23,10 @@ pub(super) struct Layout {
 
 impl Layout {
     /// All sizes of a feature map, with every product checked against overflow and limits.
+    #[expect(
+        clippy::cast_possible_truncation,
+        reason = "no part exceeds the bytes of the whole map, which isize holds"
+    )]
     pub(super) fn new(grid: &BevGrid, channels: u32, codec: &Codec, limits: &Limits) -> Result<Self, WireError> {
         grid.check(limits)?;
         let cells = u64::from(grid.width) * u64::from(grid.height);

@@ -21,6 +21,8 @@ mod layout;
 mod rate;
 mod selection;
 
+use std::ops::Range;
+
 use serde::{Deserialize, Serialize};
 
 use crate::BevFeatures;
@@ -164,7 +166,8 @@ pub fn encode_features(
         (Some(gated), None) if gated.len() < layout.cells => gated,
         _ => return encode_selected(features, dense, None, config.zstd_level),
     };
-    let codec = Codec { selection: Selection::TopK { cells: selected.len() as u32 }, ..dense };
+    let codec =
+        Codec { selection: Selection::TopK { cells: u32::try_from(selected.len()).unwrap_or(u32::MAX) }, ..dense };
     let values = selection::gather(&features.values, layout.cells, &selected);
     encode_selected(BevFeatures { values, ..features }, codec, Some(&selected), config.zstd_level)
 }
@@ -275,13 +278,16 @@ impl EncodedFeatures {
             (body, _) => body,
         };
         let raw = unpack(body, codec.compression, layout.len())?;
-        let values =
-            dtype::read(codec.dtype, &raw[layout.scales.clone()], &raw[layout.values.clone()], layout.selected)?;
+        let part = |range: &Range<usize>| {
+            let (expected, found) = (range.end as u64, raw.len() as u64);
+            raw.get(range.clone()).ok_or(WireError::Shape { what: "bytes of a feature map", expected, found })
+        };
+        let values = dtype::read(codec.dtype, part(&layout.scales)?, part(&layout.values)?, layout.selected)?;
         check_values("feature", &values, limits.max_abs_value)?;
         let (values, sent) = match codec.selection {
             Selection::Dense => (values, None),
             Selection::TopK { .. } => {
-                let selected = selection::read_mask(&raw[layout.mask.clone()], layout.cells, layout.selected)?;
+                let selected = selection::read_mask(part(&layout.mask)?, layout.cells, layout.selected)?;
                 drop(raw);
                 let (map, sent) = selection::scatter(&values, channels as usize, layout.cells, &selected);
                 (map, Some(sent))

@@ -147,7 +147,11 @@ fn wanted(features: &BevFeatures, config: &CodecConfig, confidence: Option<&[f32
     let cells = features.grid.cells();
     selection::check_confidence(confidence, cells)?;
     let passed = gate.cells(confidence, &features.grid)?.len();
-    Ok(if passed < cells { Selection::TopK { cells: passed as u32 } } else { Selection::Dense })
+    Ok(if passed < cells {
+        Selection::TopK { cells: u32::try_from(passed).unwrap_or(u32::MAX) }
+    } else {
+        Selection::Dense
+    })
 }
 
 fn body_bytes(features: &BevFeatures, dtype: Dtype, selection: Selection) -> Result<u64, WireError> {

@@ -12,8 +12,8 @@ pub(super) fn check_confidence(confidence: &[f32], cells: usize) -> Result<(), W
         let (expected, found) = (cells as u64, confidence.len() as u64);
         return Err(WireError::Shape { what: "confidence map", expected, found });
     }
-    if let Some(index) = confidence.iter().position(|value| !value.is_finite()) {
-        let (value, min, max) = (confidence[index].into(), f32::MIN.into(), f32::MAX.into());
+    if let Some((index, value)) = confidence.iter().enumerate().find(|(_, value)| !value.is_finite()) {
+        let (value, min, max) = ((*value).into(), f32::MIN.into(), f32::MAX.into());
         return Err(WireError::Value { what: "confidence", index, value, min, max });
     }
     Ok(())
@@ -36,11 +36,13 @@ pub(super) fn within_budget(
     let for_cells = budget.checked_sub(needed).ok_or(WireError::Budget { budget, needed })?;
     let fitting = usize::try_from(for_cells / (u64::from(channels) * dtype.size())).unwrap_or(usize::MAX);
     // A grid has at most 2^32 - 1 cells.
-    let candidates = candidates.map_or_else(|| (0..confidence.len() as u32).collect(), <[u32]>::to_vec);
+    let all = || (0..u32::try_from(confidence.len()).unwrap_or(u32::MAX)).collect();
+    let candidates = candidates.map_or_else(all, <[u32]>::to_vec);
     Ok(most_confident(confidence, candidates, fitting))
 }
 
 /// The `count` most confident cells, in row-major order; ties go to the first.
+#[expect(clippy::indexing_slicing, reason = "cells are positions in the confidence map, whose length was checked")]
 fn most_confident(confidence: &[f32], mut cells: Vec<u32>, count: usize) -> Vec<u32> {
     if count < cells.len() {
         let descending = |a: &u32, b: &u32| confidence[*b as usize].total_cmp(&confidence[*a as usize]).then(a.cmp(b));
@@ -52,6 +54,7 @@ fn most_confident(confidence: &[f32], mut cells: Vec<u32>, count: usize) -> Vec<
 }
 
 /// `[C, K]` values of the selected cells out of `[C, H W]`.
+#[expect(clippy::indexing_slicing, reason = "the sender's own cells are positions in its map")]
 pub(super) fn gather(values: &[f32], cells: usize, selected: &[u32]) -> Vec<f32> {
     let mut gathered = Vec::with_capacity(values.len() / cells * selected.len());
     for channel in values.chunks_exact(cells) {
@@ -61,6 +64,7 @@ pub(super) fn gather(values: &[f32], cells: usize, selected: &[u32]) -> Vec<f32>
 }
 
 /// Appends the mask of the selected cells.
+#[expect(clippy::indexing_slicing, reason = "the sender's own cells are positions in its map")]
 pub(super) fn append_mask(bytes: &mut Vec<u8>, cells: usize, selected: &[u32]) {
     let begin = bytes.len();
     bytes.resize(begin + cells.div_ceil(8), 0);
@@ -80,8 +84,8 @@ pub(super) fn read_mask(mask: &[u8], cells: usize, announced: usize) -> Result<V
         return Err(WireError::Shape { what: "cells in the mask", expected: announced as u64, found });
     }
     let mut selected = Vec::with_capacity(announced);
-    for (index, byte) in mask.iter().enumerate().filter(|(_, byte)| **byte != 0) {
-        selected.extend((0..8u32).filter(|bit| byte & (1 << bit) != 0).map(|bit| index as u32 * 8 + bit));
+    for (byte, first) in mask.iter().zip((0u32..).step_by(8)).filter(|(byte, _)| **byte != 0) {
+        selected.extend((0..8u32).filter(|bit| byte & (1 << bit) != 0).map(|bit| first + bit));
     }
     match selected.last() {
         Some(last) if *last as usize >= cells => {
@@ -96,12 +100,16 @@ pub(super) fn scatter(values: &[f32], channels: usize, cells: usize, selected: &
     let mut map = vec![0f32; channels * cells];
     let mut sent = vec![false; cells];
     for cell in selected {
-        sent[*cell as usize] = true;
+        if let Some(flag) = sent.get_mut(*cell as usize) {
+            *flag = true;
+        }
     }
     if !selected.is_empty() {
         for (plane, values) in map.chunks_exact_mut(cells).zip(values.chunks_exact(selected.len())) {
             for (cell, value) in selected.iter().zip(values) {
-                plane[*cell as usize] = *value;
+                if let Some(target) = plane.get_mut(*cell as usize) {
+                    *target = *value;
+                }
             }
         }
     }

@@ -78,9 +78,10 @@ fn names(defaults: &Value) -> BTreeMap<String, Value> {
     let mut names = BTreeMap::new();
     for (path, value) in &leaves {
         for start in 0..path.len() {
-            let is_alone = leaves.iter().filter(|(other, _)| other.ends_with(&path[start..])).count() == 1;
-            if is_alone || start == 0 {
-                names.insert(path[start..].join("_"), value.clone());
+            let name = path.get(start..).unwrap_or_default();
+            let is_unique = leaves.iter().filter(|(other, _)| other.ends_with(name)).count() == 1;
+            if is_unique || start == 0 {
+                names.insert(name.join("_"), value.clone());
             }
         }
     }

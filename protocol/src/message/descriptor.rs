@@ -73,8 +73,8 @@ impl FromStr for ModelHash {
             return Err(refuse());
         }
         let mut hash = [0; 32];
-        for (byte, pair) in hash.iter_mut().zip(text.as_bytes().chunks_exact(2)) {
-            *byte = digit(pair[0])? << 4 | digit(pair[1])?;
+        for (byte, [high, low]) in hash.iter_mut().zip(text.as_bytes().as_chunks().0) {
+            *byte = digit(*high)? << 4 | digit(*low)?;
         }
         Ok(Self(hash))
     }

@@ -4,8 +4,12 @@
 //! - [`output`], [`progress`], [`text_table`]: standard output and error, progress bars, tables.
 //! - [`bounded_file`], [`atomic_file`], [`csv_file`]: reads with a limit on their size, atomic writes, CSV.
 //! - [`statistics`], [`stage_times`], [`nanos`]: quantiles and correlations, the stopwatch, durations in nanoseconds.
+//! - [`rounding`]: floats to integers.
 //! - [`random`]: seeds derived from seeds, and draws that depend on the seed only.
 
+// This crate reads what other processes and people wrote: an index or a cast that does not fit is an error there, not
+// a panic or another number.
+#![cfg_attr(not(test), deny(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::indexing_slicing))]
 #![warn(clippy::print_stdout, clippy::print_stderr)]
 
 pub mod atomic_file;
@@ -16,6 +20,7 @@ pub mod nanos;
 pub mod output;
 pub mod progress;
 pub mod random;
+pub mod rounding;
 pub mod sibling_program;
 pub mod stage_times;
 pub mod statistics;

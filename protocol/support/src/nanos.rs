@@ -2,6 +2,8 @@
 
 use std::time::{Duration, Instant};
 
+use crate::rounding;
+
 /// Nanoseconds of a duration.
 #[must_use]
 pub fn of(time: Duration) -> u64 {
@@ -17,7 +19,7 @@ pub fn between(began: Instant, at: Instant) -> u64 {
 /// Nanoseconds of milliseconds, rounded; 0 for negative values and for NaN.
 #[must_use]
 pub fn of_ms(ms: f64) -> u64 {
-    (ms * 1e6).round().max(0.0) as u64
+    rounding::to_u64(ms * 1e6)
 }
 
 #[cfg(test)]

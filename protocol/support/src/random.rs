@@ -49,6 +49,7 @@ impl SplitMix64 {
     }
 
     /// Uniform integer in `0..count`; 0 if `count` is 0.
+    #[expect(clippy::cast_possible_truncation, reason = "the product's upper half is below `count`")]
     pub fn below(&mut self, count: usize) -> usize {
         ((u128::from(self.next_u64()) * count as u128) >> 64) as usize
     }
@@ -83,7 +84,7 @@ impl RngCore for SplitMix64 {
 
     fn fill_bytes(&mut self, bytes: &mut [u8]) {
         for chunk in bytes.chunks_mut(8) {
-            chunk.copy_from_slice(&self.next_u64().to_le_bytes()[..chunk.len()]);
+            chunk.iter_mut().zip(self.next_u64().to_le_bytes()).for_each(|(byte, random)| *byte = random);
         }
     }
 }

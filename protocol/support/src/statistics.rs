@@ -20,12 +20,13 @@ pub fn sorted(values: &[f64]) -> Vec<f64> {
 /// Every p50, p95 and p99 of a report is computed here. Order statistics that a fitted model takes as its input are not
 /// percentiles of a report and keep the rule with which the model was fitted.
 #[must_use]
+#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a cast from a float saturates")]
 pub fn quantile(sorted: &[f64], q: f64) -> Option<f64> {
     let last = sorted.len().checked_sub(1)?;
     let rank = q * last as f64;
     let below = (rank.floor() as usize).min(last);
     let above = (below + 1).min(last);
-    let (low, high, share) = (sorted[below], sorted[above], rank - below as f64);
+    let (low, high, share) = (*sorted.get(below)?, *sorted.get(above)?, rank - below as f64);
     // The difference of infinite values is undefined.
     Some(if share == 0.0 || low == high { low } else { low + (high - low) * share })
 }

@@ -11,6 +11,7 @@ use super::frame_files::{AgentFolder, BIN, PCD, RADAR, holds_pairs};
 use super::points::{SweepStorage, Sweeps};
 use super::yaml::{self, Field};
 use super::{MissingFrame, OpenOptions, ReadError, Tick, files};
+use support::rounding;
 
 /// Depth below the opened folder to which scenarios are searched.
 const MAX_DEPTH: usize = 3;
@@ -122,7 +123,7 @@ impl ScenarioFolder {
         let all: BTreeSet<&String> = by_agent.values().flat_map(|agent| &agent.stems).collect();
         let mut missing = Vec::new();
         for stem in &all {
-            let without = agents.iter().filter(|id| !by_agent[id].stems.contains(*stem));
+            let without = agents.iter().filter(|id| by_agent.get(id).is_some_and(|agent| !agent.stems.contains(*stem)));
             missing.extend(without.map(|id| MissingFrame { agent: id.clone(), stem: (*stem).clone() }));
         }
         let mut stems: Vec<String> = all.into_iter().cloned().collect();
@@ -183,7 +184,7 @@ impl ScenarioFolder {
         let times: Vec<u64> = match (numbers, tick_nanos) {
             (Some(numbers), Some(nanos)) => numbers.iter().map(|number| number.saturating_mul(nanos)).collect(),
             (Some(numbers), None) => {
-                let step = numbers.windows(2).map(|pair| pair[1] - pair[0]).filter(|&step| step > 0).min().unwrap_or(1);
+                let step = numbers.array_windows().map(|[a, b]| b - a).filter(|&step| step > 0).min().unwrap_or(1);
                 let first = numbers.first().copied().unwrap_or(0);
                 numbers.iter().map(|number| ((number - first) / step).saturating_mul(period_nanos)).collect()
             }
@@ -206,7 +207,7 @@ impl ScenarioFolder {
         if !(1e-6..=10.0).contains(&seconds) {
             return Err(delta.error(format!("{seconds} s, expected 1e-6 to 10 s: the tick's length is not used")));
         }
-        Ok(Some((seconds * 1e9).round() as u64))
+        Ok(Some(rounding::to_u64(seconds * 1e9)))
     }
 }
 

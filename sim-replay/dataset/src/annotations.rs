@@ -141,6 +141,7 @@ impl<'a> Annotations<'a> {
 }
 
 /// Ids are integers; those that went through an array of floats have a point.
+#[expect(clippy::cast_possible_truncation, reason = "an integer below 1e15")]
 fn listed_id(key: &str, field: &Field<'_>) -> Result<i64, ReadError> {
     let whole = || key.parse().ok().filter(|number: &f64| number.fract() == 0.0 && number.abs() < 1e15);
     let id = key.parse().ok().or_else(|| whole().map(|number| number as i64));

@@ -34,7 +34,8 @@ impl CarlaPose {
     /// `location_m` without rotation, as OpenCOOD does (`opencood/utils/box_utils.py`).
     #[must_use]
     pub fn of_box(location_m: [f64; 3], roll_yaw_pitch_deg: [f64; 3], center_m: [f64; 3]) -> Self {
-        Self { position_m: std::array::from_fn(|axis| location_m[axis] + center_m[axis]), roll_yaw_pitch_deg }
+        let ([x, y, z], [dx, dy, dz]) = (location_m, center_m);
+        Self { position_m: [x + dx, y + dy, z + dz], roll_yaw_pitch_deg }
     }
 
     /// Local-to-world matrix, still left-handed.

@@ -15,7 +15,6 @@ use serde::{Deserialize, Serialize};
 
 pub use config::ProtocolConfig;
 pub use preset::PRESETS;
-pub(crate) use preset::preset_of_layout;
 
 use crate::Scenario;
 use crate::ground_truth::GroundTruthRule;
@@ -88,15 +87,18 @@ impl EvaluationProtocol {
         if self.exact_range {
             return self.ground_truth;
         }
-        let within = |[low, high]: [f64; 2], axis: usize| [low.max(area_m[axis]), high.min(area_m[axis + 3])];
+        let [x_low, y_low, z_low, x_high, y_high, z_high] = area_m;
+        let within = |[low, high]: [f64; 2], from, to| [low.max(from), high.min(to)];
         let GroundTruthRule { x_m, y_m, z_m, .. } = self.ground_truth;
-        GroundTruthRule { x_m: within(x_m, 0), y_m: within(y_m, 1), z_m: within(z_m, 2), ..self.ground_truth }
+        let (x_m, y_m) = (within(x_m, x_low, x_high), within(y_m, y_low, y_high));
+        GroundTruthRule { x_m, y_m, z_m: within(z_m, z_low, z_high), ..self.ground_truth }
     }
 
     /// The scenario with the agents that take part, the ego first; none if no agent is of the requested kind.
     #[must_use]
     pub fn arrange(&self, scenario: &Scenario) -> Option<Scenario> {
-        let is_unit = |index: &usize| scenario.roadside_units.contains(&scenario.agents[*index]);
+        let is_unit =
+            |index: &usize| scenario.agents.get(*index).is_some_and(|agent| scenario.roadside_units.contains(agent));
         let (units, vehicles): (Vec<usize>, Vec<usize>) = (0..scenario.agents.len()).partition(is_unit);
         let mut order = match (self.agents, self.ego) {
             (AgentKinds::Vehicles, _) => vehicles,

@@ -86,7 +86,8 @@ pub fn merge(frames_of_tick: &[&Frame], ego_index: usize, rule: &GroundTruthRule
     let mut seen = HashSet::new();
     let mut merged = Vec::new();
     for index in contributors {
-        for object in annotations[index].iter().filter(|object| rule.classes.contains(object.class)) {
+        let listed = annotations.get(index).copied().unwrap_or_default();
+        for object in listed.iter().filter(|object| rule.classes.contains(object.class)) {
             let box3d = upright_box(object, &ego_from_world);
             if rule.keeps(&box3d) && seen.insert(object.id) {
                 merged.push((object.id, box3d));
@@ -116,8 +117,8 @@ pub fn contributors(frames_of_tick: &[&Frame], ego_index: usize, comm_range_m: f
     let Some(ego) = position(ego_index) else { return Vec::new() };
     let in_range = |&index: &usize| {
         let Some(other) = position(index).filter(|_| index != ego_index) else { return false };
-        let [dx, dy] = [0, 1].map(|axis| other.translation_m[axis] - ego.translation_m[axis]);
-        dx.hypot(dy) <= comm_range_m
+        let ([x, y, _], [ego_x, ego_y, _]) = (other.translation_m, ego.translation_m);
+        (x - ego_x).hypot(y - ego_y) <= comm_range_m
     };
     std::iter::once(ego_index).chain((0..frames_of_tick.len()).filter(in_range)).collect()
 }

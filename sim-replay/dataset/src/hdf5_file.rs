@@ -3,6 +3,11 @@
 //! Version 0 of the superblock, version 1 of object headers, contiguous data: the oldest form, which every HDF5 library
 //! reads. Two data sets of numbers need no more, and no C library.
 
+#![expect(
+    clippy::cast_possible_truncation,
+    reason = "names, shapes and messages that this module writes itself are short"
+)]
+
 /// A signed number of 8 bytes, little-endian, and a double, as messages of type.
 const I64: [u8; 12] = [0x10, 0x08, 0, 0, 8, 0, 0, 0, 0, 0, 64, 0];
 const F64: [u8; 20] = [0x11, 0x20, 0x3f, 0, 8, 0, 0, 0, 0, 0, 64, 0, 52, 11, 0, 52, 0xff, 0x03, 0, 0];

@@ -12,6 +12,7 @@ use protocol::Pose;
 
 use super::faults::Faults;
 use super::{ReadError, files};
+use support::rounding;
 
 /// Largest HDF5 file, and largest dataset in it, that is read, bytes: a million poses.
 const MAX_BYTES: usize = 128 << 20;
@@ -64,12 +65,13 @@ fn parse(
             continue;
         }
         let pose = pose(row, order).map_err(|error| wrong(path, "poses", format!("entry {index}: {error}")));
-        by_time.extend(faults.take(pose).map(|pose| (*stamp as u64, pose)));
+        by_time.extend(faults.take(pose).map(|pose| (rounding::to_u64(stamp.floor()), pose)));
     }
     faults.report("row", problems);
     Ok(by_time)
 }
 
+#[expect(clippy::indexing_slicing, reason = "three lines of four columns are twelve numbers")]
 fn pose(row: &[f64; 12], order: RowOrder) -> Result<Pose, protocol::PoseError> {
     let mut matrix = Matrix4::identity();
     for line in 0..3 {

@@ -10,10 +10,21 @@ use protocol::{CavId, Handedness, Pose};
 
 use super::frame_files::{named_once, usual_stems};
 use super::kitti_text::{self, Calibration};
+use super::layouts::{LayoutRow, Reader};
 use super::points::{SweepStorage, Sweeps};
 use super::{FrameSource, Layout, OpenOptions, Problem, ReadError, Scenario, Tick, classes, files, single_vehicle};
 use crate::frame::{Frame, Object, ObjectClass};
 use crate::pcd::PcdCloud;
+
+/// KITTI object detection.
+pub(crate) static KITTI_OBJECT: LayoutRow = LayoutRow {
+    key: "kitti_object",
+    name: "KITTI object",
+    data_sets: "KITTI object detection",
+    files: "velodyne/<frame>.bin and calib/<frame>.txt (a folder)",
+    protocol: "opv2v",
+    reader: Some(Reader::Sequence { is_one: is_split, open }),
+};
 
 /// Numbers after the type in a line of labels; detections have a score as well.
 const LABEL_NUMBERS: usize = 14;
@@ -51,7 +62,7 @@ pub(super) fn open(
     let files = ticks.iter().map(|tick| velodyne.join(format!("{}.bin", tick.stem)));
     let sweeps = Sweeps::of_single_vehicle(SweepStorage::ByName, files, options);
     let source = Split { dir: dir.to_owned(), has_labels: dir.join("label_2").is_dir(), sweeps };
-    Ok(single_vehicle(files::name_below(root, dir), Layout::KittiObject, ticks, Arc::new(source)))
+    Ok(single_vehicle(files::name_below(root, dir), Layout::KITTI_OBJECT, ticks, Arc::new(source)))
 }
 
 impl FrameSource for Split {
@@ -177,7 +188,7 @@ mod tests {
         let line = "Car 0.00 0 -1.57 0 0 0 0 1.5 1.6 4.0 2.0 1.7 9.7 -1.5707963267948966";
         let dir = build(&format!("{line}\nDontCare -1 -1 -10 0 0 0 0 -1 -1 -1 -1000 -1000 -1000 -10\n{line} 0.9\n"));
         let dataset = crate::open(dir.path()).unwrap();
-        assert_eq!((dataset.layout, dataset.scenarios[0].name.as_str()), (Layout::KittiObject, "training"));
+        assert_eq!((dataset.layout, dataset.scenarios[0].name.as_str()), (Layout::KITTI_OBJECT, "training"));
         let frame = dataset.scenarios[0].load(0, 0, &LoadOptions::default()).unwrap();
         assert_eq!(frame.objects.len(), 2);
         let car = &frame.objects[0];

@@ -11,10 +11,22 @@ use protocol::{CavId, Handedness, Pose};
 
 use super::faults::Faults;
 use super::kitti_text::{self, Calibration};
+use super::layouts::{LayoutRow, Reader};
 use super::points::{SweepStorage, Sweeps};
 use super::{FrameSource, Layout, OpenOptions, ReadError, Scenario, Tick, files, single_vehicle};
 use crate::frame::Frame;
 use crate::pcd::PcdCloud;
+use support::rounding;
+
+/// KITTI odometry.
+pub(crate) static KITTI_ODOMETRY: LayoutRow = LayoutRow {
+    key: "kitti_odometry",
+    name: "KITTI odometry",
+    data_sets: "KITTI odometry, SemanticKITTI",
+    files: "velodyne/<scan>.bin and calib.txt (a file)",
+    protocol: "opv2v",
+    reader: Some(Reader::Sequence { is_one: is_sequence, open }),
+};
 
 /// A sequence.
 #[derive(Debug)]
@@ -53,7 +65,7 @@ pub(super) fn open(
     let files = ticks.iter().map(|tick| velodyne.join(format!("{}.bin", tick.stem)));
     let sweeps = Sweeps::of_single_vehicle(SweepStorage::ByName, files, options);
     let source = Sequence { dir: dir.to_owned(), world_from_lidar: poses, sweeps };
-    Ok(single_vehicle(files::name_below(root, dir), Layout::KittiOdometry, ticks, Arc::new(source)))
+    Ok(single_vehicle(files::name_below(root, dir), Layout::KITTI_ODOMETRY, ticks, Arc::new(source)))
 }
 
 /// Number and stem of the scans. Files of other names are left out.
@@ -158,7 +170,7 @@ fn times(
         if !(0.0..=1e9).contains(&seconds) {
             return Err(kitti_text::malformed(&path, line, None, format!("{seconds} s, expected 0 to 1e9")));
         }
-        Ok((seconds * 1e9).round() as u64)
+        Ok(rounding::to_u64(seconds * 1e9))
     })?;
     faults.report("scan", problems);
     let needed = scans.iter().map(|(scan, _)| scan + 1).max().unwrap_or(0);
@@ -201,7 +213,7 @@ mod tests {
         build(dir.path(), "sequences/07", "poses/07.txt", poses);
         let dataset = crate::open(dir.path()).unwrap();
         let scenario = &dataset.scenarios[0];
-        assert_eq!((dataset.layout, scenario.name.as_str()), (Layout::KittiOdometry, "sequences/07"));
+        assert_eq!((dataset.layout, scenario.name.as_str()), (Layout::KITTI_ODOMETRY, "sequences/07"));
         let frame = scenario.load(0, 1, &LoadOptions::default()).unwrap();
         let moved = frame.world_from_lidar.unwrap().translation_m;
         assert!((moved[0] - 2.0).abs() < 1e-9 && (moved[1] + 1.0).abs() < 1e-9 && moved[2].abs() < 1e-9, "{moved:?}");

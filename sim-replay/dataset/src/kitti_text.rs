@@ -67,6 +67,7 @@ pub(super) fn rigid(path: &Path, line: u64, field: Option<&str>, rows: &[f64; 12
     Pose::from_matrix(&matrix(rows)).map_err(|error| malformed(path, line, field, error.to_string()))
 }
 
+#[expect(clippy::indexing_slicing, reason = "twelve numbers are three lines of four columns")]
 fn matrix(rows: &[f64; 12]) -> Matrix4<f64> {
     let mut matrix = Matrix4::identity();
     for (index, value) in rows.iter().enumerate() {

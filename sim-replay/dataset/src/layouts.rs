@@ -1,160 +1,133 @@
-//! Table of the supported layouts: name, data sets, and the files that identify them. Messages and `--help` use it.
+//! Table of the supported layouts: name, data sets, the files that identify them, and their readers. Messages and
+//! `--help` use it, and a folder is opened by it.
 
+use std::fmt;
 use std::fmt::Write;
+use std::path::Path;
 
-use serde::Serialize;
+use serde::{Serialize, Serializer};
 
-/// A layout of files on disk.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Layout {
-    /// OPV2V, V2XSet, V2X-R, V2VDet and generated scenes: a folder per agent, YAML and PCD per frame, left-handed.
-    Opv2v,
-    /// V2V4Real: the same folders, with pose matrices and objects in the LiDAR frame, right-handed.
-    V2v4Real,
-    /// V2X-Real and V2XPnP: the folders of OPV2V with `.bin` sweeps, right-handed.
-    V2xReal,
-    /// DAIR-V2X-C: one vehicle and one roadside unit, JSON per frame.
-    Dair,
-    /// V2X-Seq (SPD): DAIR-V2X as sequences with track ids.
-    V2xSeq,
-    /// V2X-Sim 2.0: nuScenes tables and sweeps of several agents.
-    V2xSim,
-    /// Open MARS: nuScenes tables of several vehicles.
-    Mars,
-    /// nuScenes: tables of one vehicle.
-    NuScenes,
-    /// Localization sequences of NCLT, as recorded or as converted by LightLoc.
-    Nclt,
-    /// Localization sequences of Oxford and QEOxford, as converted by LightLoc.
-    Oxford,
-    /// KITTI odometry.
-    KittiOdometry,
-    /// KITTI object detection.
-    KittiObject,
-    /// A recording of a live run ([`recording`]).
-    Recording,
-}
+use crate::{
+    Dataset, OpenOptions, ReadError, Scenario, dair, kitti_object, kitti_odometry, localization, nuscenes,
+    opv2v_family, recorded,
+};
 
-/// Description of a layout for users.
-#[derive(Debug, Clone, Copy)]
-pub struct LayoutDescription {
-    /// The layout.
-    pub layout: Layout,
+/// A layout of files on disk: its row of the table.
+#[derive(Clone, Copy)]
+pub struct Layout(pub(crate) &'static LayoutRow);
+
+/// Row of a layout, in the file of its reader.
+#[derive(Debug)]
+pub struct LayoutRow {
+    /// Its name in files of results.
+    pub(crate) key: &'static str,
     /// Its name in messages and tables.
     pub name: &'static str,
     /// The data sets that are published in it.
     pub data_sets: &'static str,
     /// The files that identify it, relative to a scenario's folder or the root of the data set.
     pub files: &'static str,
+    /// Name of the evaluation protocol that is the default for it.
+    pub(crate) protocol: &'static str,
+    /// Its reader; `None`: that of the row before, which detects both.
+    pub(crate) reader: Option<Reader>,
 }
 
-const fn row(layout: Layout, name: &'static str, data_sets: &'static str, files: &'static str) -> LayoutDescription {
-    LayoutDescription { layout, name, data_sets, files }
+/// Reader of one or several layouts.
+#[derive(Debug)]
+pub(crate) enum Reader {
+    /// Opens the data sets at or below a folder; `Ok(None)` where there are none.
+    DataSet(fn(&Path, &OpenOptions) -> Result<Option<Dataset>, ReadError>),
+    /// Opens sequences of a single vehicle, one at a time.
+    Sequence {
+        /// True for the folder of a sequence.
+        is_one: fn(&Path) -> bool,
+        /// Opens it; its name is relative to the first path.
+        open: fn(&Path, &Path, &OpenOptions, &mut Vec<ReadError>) -> Result<Scenario, ReadError>,
+    },
 }
 
-/// All layouts, in the order in which they are tried on a folder.
-pub const LAYOUTS: [LayoutDescription; 13] = [
-    row(
-        Layout::Recording,
-        "recording of a live run",
-        "runs of v2vloc",
-        "a file <name>.mcap, or recording.mcap in a run folder",
-    ),
-    row(
-        Layout::Dair,
-        "DAIR-V2X",
-        "DAIR-V2X-C",
-        "cooperative/data_info.json with vehicle_pointcloud_path, vehicle-side/, infrastructure-side/",
-    ),
-    row(
-        Layout::V2xSeq,
-        "V2X-Seq",
-        "V2X-Seq-SPD",
-        "cooperative/data_info.json with vehicle_frame, vehicle-side/, infrastructure-side/",
-    ),
-    row(
-        Layout::V2xSim,
-        "V2X-Sim",
-        "V2X-Sim 2.0",
-        "<version>/sample.json and sample_data.json (nuScenes tables), a LiDAR LIDAR_TOP_id_<agent>",
-    ),
-    row(
-        Layout::Mars,
-        "Open MARS",
-        "Open MARS",
-        "<version>/sample.json and sample_data.json (nuScenes tables), a LiDAR LIDAR_FRONT_CENTER or LIDAR_FRONT_CENTER_<vehicle>",
-    ),
-    row(
-        Layout::NuScenes,
-        "nuScenes",
-        "nuScenes",
-        "<version>/sample.json and sample_data.json (nuScenes tables), the LiDAR LIDAR_TOP",
-    ),
-    row(
-        Layout::Opv2v,
-        "OPV2V layout",
-        "OPV2V, V2XSet, V2X-R, V2VDet, V2X-Radar, RCooper as its converter writes it, generated scenes",
-        "<scenario>/<agent>/<frame>.yaml and .pcd; lidar_pose of 6 numbers",
-    ),
-    row(
-        Layout::V2v4Real,
-        "V2V4Real layout",
-        "V2V4Real",
-        "<scenario>/<agent>/<frame>.yaml and .pcd; lidar_pose a 4x4 matrix or 16 numbers",
-    ),
-    row(
-        Layout::V2xReal,
-        "V2X-Real layout",
-        "V2X-Real, V2XPnP",
-        "<scenario>/<agent>/<frame>.yaml and .bin (float32 x y z intensity); lidar_pose of 6 numbers",
-    ),
-    row(
-        Layout::KittiObject,
-        "KITTI object",
-        "KITTI object detection",
-        "velodyne/<frame>.bin and calib/<frame>.txt (a folder)",
-    ),
-    row(
-        Layout::KittiOdometry,
-        "KITTI odometry",
-        "KITTI odometry, SemanticKITTI",
-        "velodyne/<scan>.bin and calib.txt (a file)",
-    ),
-    row(
-        Layout::Nclt,
-        "NCLT localization sequences",
-        "NCLT, as published or as LightLoc converts it",
-        "<day>/velodyne_sync/<microseconds>.bin, or <day>/velodyne_left/<microseconds>.bin in a folder named by a date",
-    ),
-    row(
-        Layout::Oxford,
-        "Oxford localization sequences",
-        "Oxford Radar RobotCar and QEOxford as LightLoc converts them",
-        "<sequence>/velodyne_left/<microseconds>.bin",
-    ),
+/// All layouts, in the order in which they are tried on a folder: data sets before sequences.
+pub static LAYOUTS: [&LayoutRow; 13] = [
+    &recorded::RECORDING,
+    &dair::DAIR,
+    &dair::V2XSEQ,
+    &nuscenes::V2XSIM,
+    &nuscenes::MARS,
+    &nuscenes::NUSCENES,
+    &opv2v_family::OPV2V,
+    &opv2v_family::V2V4REAL,
+    &opv2v_family::V2XREAL,
+    &kitti_object::KITTI_OBJECT,
+    &kitti_odometry::KITTI_ODOMETRY,
+    &localization::NCLT,
+    &localization::OXFORD,
 ];
 
 impl Layout {
-    /// Its row of [`LAYOUTS`].
-    #[must_use]
-    pub fn description(self) -> &'static LayoutDescription {
-        // A test checks that every layout has a row.
-        LAYOUTS.iter().find(|row| row.layout == self).unwrap_or(&LAYOUTS[0])
-    }
+    /// OPV2V, V2XSet, V2X-R, V2VDet and generated scenes: a folder per agent, YAML and PCD per frame, left-handed.
+    pub const OPV2V: Self = Self(&opv2v_family::OPV2V);
+    /// V2V4Real: the same folders, with pose matrices and objects in the LiDAR frame, right-handed.
+    pub const V2V4REAL: Self = Self(&opv2v_family::V2V4REAL);
+    /// V2X-Real and V2XPnP: the folders of OPV2V with `.bin` sweeps, right-handed.
+    pub const V2XREAL: Self = Self(&opv2v_family::V2XREAL);
+    /// DAIR-V2X-C: one vehicle and one roadside unit, JSON per frame.
+    pub const DAIR: Self = Self(&dair::DAIR);
+    /// V2X-Seq (SPD): DAIR-V2X as sequences with track ids.
+    pub const V2XSEQ: Self = Self(&dair::V2XSEQ);
+    /// V2X-Sim 2.0: nuScenes tables and sweeps of several agents.
+    pub const V2XSIM: Self = Self(&nuscenes::V2XSIM);
+    /// Open MARS: nuScenes tables of several vehicles.
+    pub const MARS: Self = Self(&nuscenes::MARS);
+    /// nuScenes: tables of one vehicle.
+    pub const NUSCENES: Self = Self(&nuscenes::NUSCENES);
+    /// Localization sequences of NCLT, as recorded or as converted by LightLoc.
+    pub const NCLT: Self = Self(&localization::NCLT);
+    /// Localization sequences of Oxford and QEOxford, as converted by LightLoc.
+    pub const OXFORD: Self = Self(&localization::OXFORD);
+    /// KITTI odometry.
+    pub const KITTI_ODOMETRY: Self = Self(&kitti_odometry::KITTI_ODOMETRY);
+    /// KITTI object detection.
+    pub const KITTI_OBJECT: Self = Self(&kitti_object::KITTI_OBJECT);
+    /// A recording of a live run ([`recording`]).
+    pub const RECORDING: Self = Self(&recorded::RECORDING);
 
     /// Its name in messages and tables.
     #[must_use]
     pub fn name(self) -> &'static str {
-        self.description().name
+        self.0.name
+    }
+}
+
+impl PartialEq for Layout {
+    fn eq(&self, other: &Self) -> bool {
+        self.0.key == other.0.key
+    }
+}
+
+impl Eq for Layout {}
+
+impl fmt::Debug for Layout {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.0.key)
+    }
+}
+
+impl Serialize for Layout {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.serialize_str(self.0.key)
     }
 }
 
 /// One line per layout: name, data sets in brackets, and the files that identify it.
 #[must_use]
 pub fn layouts_text() -> String {
+    text_of(&LAYOUTS)
+}
+
+pub(crate) fn text_of(layouts: &[&LayoutRow]) -> String {
     let mut text = String::new();
-    for LayoutDescription { name, data_sets, files, .. } in &LAYOUTS {
+    for LayoutRow { name, data_sets, files, .. } in layouts {
         let data_sets = if name == data_sets { String::new() } else { format!(" ({data_sets})") };
         // Writing to a String does not fail.
         let _ = writeln!(text, "  {name}{data_sets}: {files}");
@@ -169,16 +142,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_layout_has_one_row_of_its_own_name() {
-        use Layout::{
-            Dair, KittiObject, KittiOdometry, Mars, Nclt, NuScenes, Opv2v, Oxford, Recording, V2v4Real, V2xReal,
-            V2xSeq, V2xSim,
-        };
-        let multi_agent = [Opv2v, V2v4Real, V2xReal, Dair, V2xSeq, V2xSim, Mars];
-        let all = [&multi_agent[..], &[NuScenes, Nclt, Oxford, KittiOdometry, KittiObject, Recording]].concat();
-        assert!(all.iter().all(|layout| layout.description().layout == *layout));
+    fn every_layout_has_names_of_its_own_and_a_reader() {
+        let keys: HashSet<&str> = LAYOUTS.iter().map(|row| row.key).collect();
         let names: HashSet<&str> = LAYOUTS.iter().map(|row| row.name).collect();
-        assert_eq!(names.len(), LAYOUTS.len());
+        assert_eq!((keys.len(), names.len()), (LAYOUTS.len(), LAYOUTS.len()));
+        assert!(LAYOUTS[0].reader.is_some(), "no row before it");
         let text = layouts_text();
         assert_eq!(text.lines().count(), LAYOUTS.len());
         assert!(text.contains("  Open MARS: <version>"), "{text}");

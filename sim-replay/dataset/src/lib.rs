@@ -12,6 +12,10 @@
 //! # }
 //! ```
 
+// This crate reads what other processes and people wrote: an index or a cast that does not fit is an error there, not
+// a panic or another number.
+#![cfg_attr(not(test), deny(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::indexing_slicing))]
+
 mod agent_folders;
 mod annotations;
 pub mod carla_pose;
@@ -41,6 +45,7 @@ mod numpy_tags;
 mod nuscenes;
 mod open;
 mod opv2v;
+mod opv2v_family;
 pub mod pcd;
 mod points;
 mod poses;
@@ -60,7 +65,7 @@ use protocol::{CavId, Handedness};
 use serde::Serialize;
 
 pub use error::ReadError;
-pub use layouts::{LAYOUTS, Layout, LayoutDescription, layouts_text};
+pub use layouts::{LAYOUTS, Layout, LayoutRow, layouts_text};
 pub use left_out::LeftOut;
 pub use listing::content_sha256;
 pub use open::{OpenOptions, open, open_with};

@@ -24,11 +24,32 @@ use protocol::{CavId, Handedness, Pose};
 
 use super::hdf5_poses::{self, RowOrder};
 use super::kitti_text::{lines, numbers};
+use super::layouts::{LayoutRow, Reader};
 use super::nclt_ground_truth::{self, GroundTruth};
 use super::points::{SweepStorage, Sweeps};
 use super::{FrameSource, Layout, OpenOptions, ReadError, Scenario, Tick, files, single_vehicle};
 use crate::frame::Frame;
 use crate::pcd::PcdCloud;
+
+/// Localization sequences of NCLT, as recorded or as converted by LightLoc.
+pub(crate) static NCLT: LayoutRow = LayoutRow {
+    key: "nclt",
+    name: "NCLT localization sequences",
+    data_sets: "NCLT, as published or as LightLoc converts it",
+    files: "<day>/velodyne_sync/<microseconds>.bin, or <day>/velodyne_left/<microseconds>.bin in a folder named by a date",
+    protocol: "opv2v",
+    reader: Some(Reader::Sequence { is_one: is_sequence, open }),
+};
+
+/// Localization sequences of Oxford and QEOxford, as converted by LightLoc.
+pub(crate) static OXFORD: LayoutRow = LayoutRow {
+    key: "oxford",
+    name: "Oxford localization sequences",
+    data_sets: "Oxford Radar RobotCar and QEOxford as LightLoc converts them",
+    files: "<sequence>/velodyne_left/<microseconds>.bin",
+    protocol: "opv2v",
+    reader: None,
+};
 
 /// Converted points, one file per sweep.
 const CONVERTED: &str = "velodyne_left";
@@ -102,7 +123,7 @@ pub(super) fn open(
     }
     let tick = |(micros, stem): (u64, String)| Tick { stem, capture_nanos: micros.saturating_mul(1000) };
     let ticks: Vec<Tick> = stamps.into_iter().map(tick).collect();
-    let layout = if storage == Storage::Oxford { Layout::Oxford } else { Layout::Nclt };
+    let layout = if storage == Storage::Oxford { Layout::OXFORD } else { Layout::NCLT };
     let files = ticks.iter().map(|tick| points_dir.join(format!("{}.bin", tick.stem)));
     let sweeps = Sweeps::of_single_vehicle(storage.of_sweeps(), files, options);
     let source = Sequence { points_dir, world_from_lidar: poses.unwrap_or_default(), sweeps };
@@ -268,7 +289,7 @@ mod tests {
             write(dir.path(), &format!("{sequence}/velodyne_left/{}.bin", T0 + 50_000 * index), &points);
         }
         let dataset = open(dir.path());
-        assert_eq!((dataset.layout, dataset.problems.len()), (Layout::Oxford, 0));
+        assert_eq!((dataset.layout, dataset.problems.len()), (Layout::OXFORD, 0));
         let scenario = &dataset.scenarios[0];
         assert_eq!((scenario.name.as_str(), scenario.ticks.len()), (sequence, 2));
         let frame = scenario.load(0, 0, &LoadOptions::default()).unwrap();
@@ -289,7 +310,7 @@ mod tests {
         write(&sequence, &format!("velodyne_left/{}.bin", T0 + 250_000), &floats(&[down[0], down[1], down[2], 0.0]));
         write(&sequence, &format!("velodyne_left/{}.bin", T0 + 300_000), &[]);
         let dataset = open(&sequence);
-        assert_eq!(dataset.layout, Layout::Nclt);
+        assert_eq!(dataset.layout, Layout::NCLT);
         let frame = dataset.scenarios[0].load(0, 0, &LoadOptions::default()).unwrap();
         let [x, y, z, _] = frame.points.xyzi[0].map(f64::from);
         let ours = frame.world_from_lidar.unwrap().isometry() * nalgebra::Point3::new(x, y, z);

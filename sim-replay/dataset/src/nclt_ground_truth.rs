@@ -12,6 +12,7 @@ use protocol::text::excerpt;
 use super::faults::Faults;
 use super::{ReadError, files};
 use support::csv_file;
+use support::rounding;
 
 /// Largest file that is read, bytes: some two million rows.
 const MAX_BYTES: u64 = 256 << 20;
@@ -82,6 +83,7 @@ impl GroundTruth {
 }
 
 /// Indices of the longest selection of values that increase.
+#[expect(clippy::indexing_slicing, reason = "all indices are of `values`, and `length` is at most that of `ends`")]
 fn longest_increasing(values: &[u64]) -> Vec<usize> {
     // Of the selections of each length, the index of the smallest last value; and the predecessor of each value.
     let mut ends: Vec<usize> = Vec::new();
@@ -107,8 +109,8 @@ fn row(path: &Path, line: u64, record: &StringRecord) -> Result<Option<(u64, Iso
         return Err(ReadError::Malformed { path: path.to_owned(), line: Some(line), field: None, reason });
     }
     let mut numbers = [0.0; COLUMNS.len()];
-    for (column, word) in record.iter().enumerate() {
-        numbers[column] = word
+    for (column, (number, word)) in numbers.iter_mut().zip(record).enumerate() {
+        *number = word
             .parse::<f64>()
             .map_err(|_| wrong(path, line, column, format!("{:?} is no number", excerpt(word, 40))))?;
     }
@@ -122,11 +124,12 @@ fn row(path: &Path, line: u64, record: &StringRecord) -> Result<Option<(u64, Iso
     }
     // nalgebra's Euler angles are Rz(yaw) Ry(pitch) Rx(roll) too.
     let rotation = UnitQuaternion::from_euler_angles(roll, pitch, heading);
-    Ok(Some((micros as u64, Isometry3::from_parts(Translation3::new(x, y, z), rotation))))
+    Ok(Some((rounding::to_u64(micros.floor()), Isometry3::from_parts(Translation3::new(x, y, z), rotation))))
 }
 
 fn wrong(path: &Path, line: u64, column: usize, reason: String) -> ReadError {
-    ReadError::Malformed { path: path.to_owned(), line: Some(line), field: Some(COLUMNS[column].to_owned()), reason }
+    let field = COLUMNS.get(column).map(|name| (*name).to_owned());
+    ReadError::Malformed { path: path.to_owned(), line: Some(line), field, reason }
 }
 
 #[cfg(test)]

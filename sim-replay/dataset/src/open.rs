@@ -1,26 +1,13 @@
-//! Opening of data sets: detects the layout of a folder.
+//! Opening of data sets: detects the layout of a folder by the table of layouts.
 
 use std::path::Path;
-use std::sync::Arc;
 
-use protocol::{CavId, Handedness};
-
-use super::agent_folders::{self, ScenarioFolder};
-use super::opv2v::Opv2v;
+use super::layouts::{LAYOUTS, LayoutRow, Reader};
 use super::points::IntensityScale;
-use super::presence::Absences;
-use super::v2v4real::V2v4Real;
-use super::written_pose::WrittenPose;
-use super::yaml::{self, Field};
-use super::{
-    Dataset, FrameSource, Layout, ReadError, Scenario, Tick, dair, files, kitti_object, kitti_odometry, layouts_text,
-    localization, nuscenes, recorded, unfinished,
-};
+use super::{Dataset, ReadError, Scenario, agent_folders, files, layouts_text, unfinished};
 
 /// Depth below the opened folder to which sequences of a single vehicle are searched.
 const SEQUENCE_DEPTH: usize = 2;
-/// Number of frames of a scenario that are tried to detect its layout.
-const FRAMES_TO_TRY: usize = 5;
 /// Largest number of faults listed when nothing can be opened.
 const SHOWN_PROBLEMS: usize = 5;
 
@@ -54,141 +41,57 @@ pub fn open(dir: &Path) -> Result<Dataset, ReadError> {
 /// # Errors
 /// As [`open`].
 pub fn open_with(dir: &Path, options: &OpenOptions) -> Result<Dataset, ReadError> {
-    let mut dataset = open_any(dir, options)?;
+    let mut dataset = open_among(&LAYOUTS, dir, options)?;
     unfinished::report(dir, &mut dataset);
     Ok(dataset)
 }
 
-fn open_any(dir: &Path, options: &OpenOptions) -> Result<Dataset, ReadError> {
-    if let Some(file) = recorded::file_of(dir) {
-        return recorded::open(&file);
-    }
-    for reader in [dair::open, nuscenes::open] {
-        if let Some(dataset) = reader(dir, options)? {
+/// Tries `layouts` in their order.
+fn open_among(layouts: &[&LayoutRow], dir: &Path, options: &OpenOptions) -> Result<Dataset, ReadError> {
+    for layout in layouts {
+        if let Some(Reader::DataSet(open)) = layout.reader
+            && let Some(dataset) = open(dir, options)?
+        {
             return Ok(dataset);
         }
     }
-    let mut problems = Vec::new();
-    let folders = agent_folders::find(dir, &mut problems)?;
-    if !folders.is_empty() {
-        return open_agent_folders(dir, &folders, options, problems);
-    }
-    // The same folders are listed again.
-    problems.clear();
-    let mut scenarios = Vec::new();
-    open_single_vehicles(dir, (dir, SEQUENCE_DEPTH), options, &mut scenarios, &mut problems)?;
+    let (mut scenarios, mut problems) = (Vec::new(), Vec::new());
+    open_sequences(layouts, dir, (dir, SEQUENCE_DEPTH), options, &mut scenarios, &mut problems)?;
     match scenarios.first().map(|scenario: &Scenario| scenario.layout) {
         Some(layout) => Ok(Dataset { layout, scenarios, problems }),
         None => Err(nothing_opened(dir, problems)),
     }
 }
 
-/// Opens the sequences and splits of one of the layouts with a single vehicle, at `dir` or below.
-fn open_single_vehicles(
+/// Opens the sequences of a single vehicle, at `dir` or below.
+fn open_sequences(
+    layouts: &[&LayoutRow],
     root: &Path,
     (dir, depth): (&Path, usize),
     options: &OpenOptions,
     scenarios: &mut Vec<Scenario>,
     problems: &mut Vec<ReadError>,
 ) -> Result<(), ReadError> {
-    let opened = if kitti_object::is_split(dir) {
-        kitti_object::open(root, dir, options, problems)
-    } else if kitti_odometry::is_sequence(dir) {
-        kitti_odometry::open(root, dir, options, problems)
-    } else if localization::is_sequence(dir) {
-        localization::open(root, dir, options, problems)
-    } else if depth > 0 {
-        for (folder, _) in files::list_below(dir, &files::list(dir)?, problems) {
-            open_single_vehicles(root, (&folder, depth - 1), options, scenarios, problems)?;
+    let reader = layouts.iter().find_map(|layout| match layout.reader {
+        Some(Reader::Sequence { is_one, open }) if is_one(dir) => Some(open),
+        _ => None,
+    });
+    match reader.map(|open| open(root, dir, options, problems)) {
+        // One sequence that cannot be opened does not prevent opening the others.
+        Some(Ok(scenario)) => scenarios.push(scenario),
+        Some(Err(error)) => problems.push(error),
+        None if depth > 0 => {
+            for (folder, _) in files::list_below(dir, &files::list(dir)?, problems) {
+                open_sequences(layouts, root, (&folder, depth - 1), options, scenarios, problems)?;
+            }
         }
-        return Ok(());
-    } else {
-        return Ok(());
-    };
-    // One sequence that cannot be opened does not prevent opening the others.
-    match opened {
-        Ok(scenario) => scenarios.push(scenario),
-        Err(error) => problems.push(error),
+        None => {}
     }
     Ok(())
 }
 
-fn open_agent_folders(
-    root: &Path,
-    folders: &[std::path::PathBuf],
-    options: &OpenOptions,
-    mut problems: Vec<ReadError>,
-) -> Result<Dataset, ReadError> {
-    let mut scenarios = Vec::with_capacity(folders.len());
-    for dir in folders {
-        match ScenarioFolder::scan(dir, &mut problems) {
-            Ok(folder) if folder.agents.is_empty() => {
-                problems.push(ReadError::malformed(dir, "no agent with a frame: the scenario is left out"));
-            }
-            Ok(folder) => scenarios.push(agent_folder_scenario(root, folder, options, &mut problems)),
-            Err(error) => problems.push(error),
-        }
-    }
-    match scenarios.first().map(|scenario| scenario.layout) {
-        Some(layout) => Ok(Dataset { layout, scenarios, problems }),
-        None => Err(nothing_opened(root, problems)),
-    }
-}
-
-fn agent_folder_scenario(
-    root: &Path,
-    folder: ScenarioFolder,
-    options: &OpenOptions,
-    problems: &mut Vec<ReadError>,
-) -> Scenario {
-    if folder.stems.is_empty() {
-        problems.push(ReadError::malformed(&folder.dir, "no frame of any agent"));
-    }
-    let layout = family_layout(&folder);
-    let sweeps = folder.sweeps(options);
-    let source_handedness = if layout == Layout::Opv2v { Handedness::Left } else { Handedness::Right };
-    let moments = folder.ticks(options.period_nanos, problems);
-    let ego_lacks = |tick: &Tick| {
-        folder.missing.iter().any(|frame| Some(&frame.agent) == folder.agents.first() && frame.stem == tick.stem)
-    };
-    let ticks: Vec<Tick> = moments.iter().filter(|tick| !ego_lacks(tick)).cloned().collect();
-    let is_unit = |id: &&CavId| id.as_str().starts_with('-');
-    Scenario {
-        name: files::name_below(root, &folder.dir),
-        agents: folder.agents.clone(),
-        absences: Absences::new(&folder.agents, &ticks, &folder.missing).among(moments),
-        ticks,
-        missing: folder.missing.clone(),
-        roadside_units: folder.agents.iter().filter(is_unit).cloned().collect(),
-        lidar_variants: folder.variants.clone(),
-        has_radar: folder.has_radar,
-        layout,
-        source_handedness,
-        source: match layout {
-            Layout::V2v4Real => Arc::new(V2v4Real { folder, sweeps }) as Arc<dyn FrameSource>,
-            _ => Arc::new(Opv2v { folder, sweeps, handedness: source_handedness }),
-        },
-    }
-}
-
-/// The layout by the shape of the first pose that can be read, and then by the kind of sweeps. Frames with another
-/// shape are reported when they are loaded.
-fn family_layout(folder: &ScenarioFolder) -> Layout {
-    let frames = folder.stems.iter().flat_map(|stem| folder.agents.iter().map(move |agent| folder.yaml(agent, stem)));
-    match frames.take(FRAMES_TO_TRY).find_map(|path| lidar_pose(&path).ok()) {
-        Some(WrittenPose::Matrix(_)) => Layout::V2v4Real,
-        _ if folder.has_bare_floats() => Layout::V2xReal,
-        _ => Layout::Opv2v,
-    }
-}
-
-fn lidar_pose(path: &Path) -> Result<WrittenPose, ReadError> {
-    let node = yaml::read(path)?;
-    WrittenPose::read(&Field::root(path, &node).required("lidar_pose")?)
-}
-
 /// The only fault, or all of them, or an unknown layout.
-fn nothing_opened(dir: &Path, mut problems: Vec<ReadError>) -> ReadError {
+pub(super) fn nothing_opened(dir: &Path, mut problems: Vec<ReadError>) -> ReadError {
     match problems.len() {
         0 => unknown(dir),
         1 => problems.swap_remove(0),
@@ -212,4 +115,76 @@ fn unknown(dir: &Path) -> ReadError {
         format!("no supported layout; at most three folders down, expected one of\n{}", layouts.trim_end())
     };
     ReadError::Layout { path: dir.to_owned(), reason }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+    use std::path::PathBuf;
+    use std::sync::Arc;
+
+    use protocol::CavId;
+
+    use super::super::{FrameSource, Layout, Tick, single_vehicle};
+    use super::*;
+    use crate::frame::Frame;
+    use crate::layouts::text_of;
+    use crate::pcd::PcdCloud;
+
+    /// All that a layout needs: a row, a reader and the source of its frames.
+    static DUMMY: LayoutRow = LayoutRow {
+        key: "dummy",
+        name: "dummy layout",
+        data_sets: "none",
+        files: "dummy.txt with a number of ticks",
+        protocol: "opv2v",
+        reader: Some(Reader::Sequence { is_one: |dir| dir.join("dummy.txt").is_file(), open: open_dummy }),
+    };
+
+    #[derive(Debug)]
+    struct Dummy(PathBuf);
+
+    impl FrameSource for Dummy {
+        fn frame(&self, _: &CavId, _: &Tick) -> Result<Frame, ReadError> {
+            Err(ReadError::malformed(&self.0, "no frames"))
+        }
+
+        fn points(&self, _: &CavId, _: &Tick, _: Option<&str>) -> Result<PcdCloud, ReadError> {
+            Ok(PcdCloud::of_finite(vec![[1.0, 2.0, 3.0, 0.5]], Vec::new()))
+        }
+
+        fn points_path(&self, _: &CavId, _: &Tick, _: Option<&str>) -> PathBuf {
+            self.0.clone()
+        }
+    }
+
+    fn open_dummy(
+        root: &Path,
+        dir: &Path,
+        options: &OpenOptions,
+        _: &mut Vec<ReadError>,
+    ) -> Result<Scenario, ReadError> {
+        let file = dir.join("dummy.txt");
+        let count = fs::read_to_string(&file).ok().and_then(|text| text.trim().parse().ok());
+        let count: u64 = count.ok_or_else(|| ReadError::malformed(&file, "no number"))?;
+        let tick = |index: u64| Tick { stem: index.to_string(), capture_nanos: index * options.period_nanos };
+        let ticks = (0..count).map(tick).collect();
+        Ok(single_vehicle(files::name_below(root, dir), Layout(&DUMMY), ticks, Arc::new(Dummy(file))))
+    }
+
+    #[test]
+    fn a_layout_is_one_row_and_one_reader() {
+        let dir = tempfile::tempdir().unwrap();
+        fs::create_dir(dir.path().join("first")).unwrap();
+        fs::write(dir.path().join("first/dummy.txt"), "3").unwrap();
+        assert!(open(dir.path()).is_err(), "the table has no such row");
+        let layouts: Vec<&LayoutRow> = LAYOUTS.iter().copied().chain([&DUMMY]).collect();
+        let dataset = open_among(&layouts, dir.path(), &OpenOptions::default()).unwrap();
+        assert_eq!((dataset.layout, dataset.scenarios.len(), dataset.problems.len()), (Layout(&DUMMY), 1, 0));
+        let scenario = &dataset.scenarios[0];
+        assert_eq!((scenario.name.as_str(), scenario.ticks.len()), ("first", 3));
+        assert_eq!(scenario.source.points(&scenario.agents[0], &scenario.ticks[0], None).unwrap().points.xyzi.len(), 1);
+        assert_eq!(serde_json::to_string(&dataset.layout).unwrap(), "\"dummy\"");
+        assert!(text_of(&layouts).contains("  dummy layout (none): dummy.txt with a number of ticks"));
+    }
 }

@@ -177,8 +177,10 @@ fn read_planar(path: &Path) -> Result<PcdCloud, ReadError> {
     let bytes = files::read_limited(path, MAX_BYTES)?;
     check_whole_points(path, bytes.len(), 16)?;
     let (numbers, _) = bytes.as_chunks::<4>();
-    let count = numbers.len() / 4;
-    let points = (0..count).map(|point| [0, 1, 2, 3].map(|c| f32::from_le_bytes(numbers[c * count + point])));
+    let (xy, zi) = numbers.split_at(numbers.len() / 2);
+    let ((x, y), (z, i)) = (xy.split_at(xy.len() / 2), zi.split_at(zi.len() / 2));
+    let points = x.iter().zip(y).zip(z.iter().zip(i));
+    let points = points.map(|((x, y), (z, i))| [x, y, z, i].map(|number| f32::from_le_bytes(*number)));
     let intensity = Some(IntensityOrigin::stored("4th block of floats", IntensityKind::Number));
     Ok(PcdCloud {
         intensity,
@@ -187,6 +189,7 @@ fn read_planar(path: &Path) -> Result<PcdCloud, ReadError> {
     })
 }
 
+#[expect(clippy::cast_possible_truncation, reason = "rounded to f32")]
 fn read_nclt_raw(path: &Path) -> Result<PcdCloud, ReadError> {
     const STEP_M: f64 = 0.005;
     const OFFSET_M: f64 = -100.0;

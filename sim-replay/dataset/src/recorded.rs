@@ -6,11 +6,22 @@ use std::sync::Arc;
 
 use protocol::{CavId, EgoMotion, Gnss, Handedness, Lidar, Limits, Payload, Radar, Stamp, Stream, Topic, Truth, wire};
 
+use super::layouts::{LayoutRow, Reader};
 use super::presence::Absences;
-use super::{Dataset, FrameSource, Layout, MissingFrame, ReadError, Scenario, Tick};
+use super::{Dataset, FrameSource, Layout, MissingFrame, OpenOptions, ReadError, Scenario, Tick};
 use crate::frame::{Frame, Object, ObjectClass};
 use crate::pcd::{IntensityKind, IntensityOrigin, PcdCloud};
 use recording::{Entry, Recording, RecordingError};
+
+/// A recording of a live run ([`recording`]).
+pub(crate) static RECORDING: LayoutRow = LayoutRow {
+    key: "recording",
+    name: "recording of a live run",
+    data_sets: "runs of v2vloc",
+    files: "a file <name>.mcap, or recording.mcap in a run folder",
+    protocol: "opv2v",
+    reader: Some(Reader::DataSet(open_given)),
+};
 
 /// Name of the recording in a run folder.
 const IN_RUN_FOLDER: &str = "recording.mcap";
@@ -21,8 +32,13 @@ pub(super) fn file_of(path: &Path) -> Option<PathBuf> {
     [path.to_path_buf(), path.join(IN_RUN_FOLDER)].into_iter().find(|file| is_recording(file))
 }
 
+/// Opens the recording that a path names.
+fn open_given(path: &Path, _: &OpenOptions) -> Result<Option<Dataset>, ReadError> {
+    file_of(path).map(|file| open(&file)).transpose()
+}
+
 /// Opens a recording as a data set of one scenario. A truncated end is reported in [`Dataset::problems`].
-pub(super) fn open(file: &Path) -> Result<Dataset, ReadError> {
+fn open(file: &Path) -> Result<Dataset, ReadError> {
     let recording = Recording::open(file).map_err(as_read_error)?;
     let mut problems = Vec::new();
     for damage in recording.damage() {
@@ -41,11 +57,11 @@ pub(super) fn open(file: &Path) -> Result<Dataset, ReadError> {
         ticks,
         missing,
         lidar_variants: Vec::new(),
-        layout: Layout::Recording,
+        layout: Layout::RECORDING,
         source_handedness: Handedness::Right,
         source: Arc::new(source),
     };
-    Ok(Dataset { layout: Layout::Recording, scenarios: vec![scenario], problems })
+    Ok(Dataset { layout: Layout::RECORDING, scenarios: vec![scenario], problems })
 }
 
 /// The sensors and the truth of a recording, by capture time.

@@ -128,7 +128,7 @@ mod tests {
 
     fn load(root: &Path, agent: usize) -> Result<Frame, ReadError> {
         let dataset = crate::open(root).unwrap();
-        assert_eq!(dataset.layout, Layout::V2v4Real);
+        assert_eq!(dataset.layout, Layout::V2V4REAL);
         dataset.scenarios[0].load(agent, 0, &LoadOptions::default())
     }
 

@@ -26,9 +26,9 @@ impl WrittenPose {
             return Err(field.error(format!("{number}, expected finite numbers")));
         }
         let sizes: Vec<usize> = shape.iter().copied().filter(|&size| size != 1).collect();
-        match sizes[..] {
-            [6] => Ok(Self::SixNumbers(CarlaPose::from(std::array::from_fn::<f64, 6, _>(|index| values[index])))),
-            [4, 4] | [16] => Ok(Self::Matrix(Matrix4::from_row_slice(&values))),
+        match (&sizes[..], values.first_chunk::<6>()) {
+            ([6], Some(numbers)) => Ok(Self::SixNumbers(CarlaPose::from(*numbers))),
+            ([4, 4] | [16], _) => Ok(Self::Matrix(Matrix4::from_row_slice(&values))),
             _ if numpy_tags::is_call(field.node()) => {
                 Err(field.error(format!("an array of shape {shape:?}, expected 6 numbers or a 4x4 matrix")))
             }

@@ -1,5 +1,7 @@
 //! Cumulative service curve of a link in integer bit-nanoseconds; rounding does not accumulate.
 
+use support::rounding;
+
 use super::config::CapacityConfig;
 use super::trace::{OPPORTUNITY_BYTES, Step, Trace};
 use super::trace_config::TraceConfig;
@@ -36,7 +38,7 @@ pub(super) fn work(bytes: u64) -> u128 {
 impl Capacity {
     pub(super) fn new(config: &CapacityConfig, trace: Option<&Trace>) -> Self {
         match (config, trace) {
-            (CapacityConfig::TokenBucket { rate_mbps, .. }, _) => Self::Constant((rate_mbps * 1e6).round() as u64),
+            (CapacityConfig::TokenBucket { rate_mbps, .. }, _) => Self::Constant(rounding::to_u64(rate_mbps * 1e6)),
             (_, Some(Trace::Steps(steps))) => {
                 let mut done = 0;
                 let mut last: Option<&Step> = None;
@@ -66,11 +68,11 @@ impl Capacity {
             Self::Constant(rate) => u128::from(*rate) * u128::from(nanos),
             Self::Steps(steps) => {
                 let index = steps.partition_point(|(step, _)| step.from_nanos <= nanos).saturating_sub(1);
-                let (step, before) = &steps[index];
+                let Some((step, before)) = steps.get(index) else { return 0 };
                 before + u128::from(step.bits_per_s) * u128::from(nanos - step.from_nanos)
             }
             Self::Opportunities(times) => {
-                let period = times[times.len() - 1];
+                let Some(period) = times.last() else { return 0 };
                 let (rounds, rest) = (nanos / period, nanos % period);
                 let passed = times.partition_point(|&time| time <= rest) as u128;
                 (u128::from(rounds) * times.len() as u128 + passed) * work(OPPORTUNITY_BYTES)
@@ -86,7 +88,7 @@ impl Capacity {
             Self::Constant(rate) => u64::try_from(wanted.div_ceil(u128::from(*rate))).ok(),
             Self::Steps(steps) => {
                 let index = steps.partition_point(|(_, before)| *before < wanted).saturating_sub(1);
-                let (step, before) = &steps[index];
+                let (step, before) = steps.get(index)?;
                 let left = wanted.saturating_sub(*before);
                 if left == 0 {
                     return Some(step.from_nanos);
@@ -97,9 +99,9 @@ impl Capacity {
             }
             Self::Opportunities(times) => {
                 let count = wanted.div_ceil(work(OPPORTUNITY_BYTES)).max(1) - 1;
-                let (rounds, place) = (count / times.len() as u128, (count % times.len() as u128) as usize);
-                let period = times[times.len() - 1];
-                u64::try_from(rounds).ok()?.checked_mul(period)?.checked_add(times[place])
+                let (rounds, place) = (count / times.len() as u128, count % times.len() as u128);
+                let (period, time) = (times.last()?, times.get(usize::try_from(place).ok()?)?);
+                u64::try_from(rounds).ok()?.checked_mul(*period)?.checked_add(*time)
             }
             Self::Later { all, offset_nanos, before } => {
                 Some(all.time_of(wanted.checked_add(*before)?)?.saturating_sub(*offset_nanos))

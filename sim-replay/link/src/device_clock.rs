@@ -42,6 +42,7 @@ impl DeviceClock {
     }
 
     /// Offset at a time after the beginning.
+    #[expect(clippy::cast_possible_truncation, reason = "a cast from a float saturates")]
     fn ahead_nanos(&self, since_nanos: u64) -> i128 {
         let set = self.step.filter(|step| since_nanos as f64 >= step.at_s * 1e9);
         let offset_ms = self.offset_ms + set.map_or(0.0, |step| step.by_ms);

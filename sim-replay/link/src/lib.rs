@@ -9,6 +9,10 @@
 //! - `sim_replay::link_node`: the same between the agents and an ego of a live run.
 //! - [`DeviceClock`]: offset and drift of the senders' clock, which shift their capture times.
 
+// This crate reads what other processes and people wrote: an index or a cast that does not fit is an error there, not
+// a panic or another number.
+#![cfg_attr(not(test), deny(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::indexing_slicing))]
+
 mod capacity;
 mod chance;
 mod config;

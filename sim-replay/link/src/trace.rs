@@ -6,6 +6,7 @@ use protocol::text::excerpt;
 
 use support::bounded_file;
 use support::csv_file::{CsvError, CsvFile, CsvRow};
+use support::rounding;
 
 /// First line of a CSV trace.
 const HEADER: &str = "time_s,rate_mbps,delay_ms,loss";
@@ -135,8 +136,8 @@ fn step(row: &CsvRow<'_>) -> Result<Step, CsvError> {
     let time_s = row.number(0, 0.0..=1e9, "0 to 1e9 seconds")?;
     let rate_mbps = row.number(1, 0.0..=1e6, "0 to 1e6 Mbit/s")?;
     Ok(Step {
-        from_nanos: (time_s * 1e9).round() as u64,
-        bits_per_s: (rate_mbps * 1e6).round() as u64,
+        from_nanos: rounding::to_u64(time_s * 1e9),
+        bits_per_s: rounding::to_u64(rate_mbps * 1e6),
         delay_ms: row.number(2, 0.0..=600_000.0, "0 to 600,000 ms")?,
         loss: row.number(3, 0.0..=1.0, "0 to 1")?,
     })

@@ -7,6 +7,7 @@ use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::de::value::MapAccessDeserializer;
 use serde::de::{Error, MapAccess, Visitor};
 use serde::{Deserialize, Deserializer, Serialize};
+use support::rounding;
 
 /// A trace: its path alone, or `{path, offset_s}`.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -26,7 +27,7 @@ impl TraceConfig {
 
     /// [`Self::offset_s`] in nanoseconds.
     pub(super) fn offset_nanos(&self) -> u64 {
-        (self.offset_s * 1e9).round().max(0.0) as u64
+        rounding::to_u64(self.offset_s * 1e9)
     }
 }
 

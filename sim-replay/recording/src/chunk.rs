@@ -94,14 +94,14 @@ fn summary(file: &File, size: u64) -> io::Result<Option<Vec<u8>>> {
         |at: usize| footer.get(at..).and_then(<[u8]>::first_chunk).map_or(0, |bytes| u64::from_le_bytes(*bytes));
     let begin = number(0);
     let len = footer_begin.checked_sub(begin).filter(|len| begin > 0 && *len <= MAX_SUMMARY_BYTES);
-    let Some(len) = len.filter(|_| head[0] == op::FOOTER && magic == MAGIC) else { return Ok(None) };
-    let mut summary = vec![0; len as usize];
+    let Some(len) = len.filter(|_| head.first() == Some(&op::FOOTER) && magic == MAGIC) else { return Ok(None) };
+    let mut summary = vec![0; usize::try_from(len).unwrap_or_default()];
     file.read_exact_at(&mut summary, begin)?;
     let mut crc = crc32fast::Hasher::new();
     crc.update(&summary);
     crc.update(head);
-    crc.update(&footer[..FOOTER_LEN - 4]);
-    let stated = &footer[FOOTER_LEN - 4..];
+    let (summed, stated) = footer.split_at(FOOTER_LEN - 4);
+    crc.update(summed);
     Ok((stated == [0; 4] || stated == crc.finalize().to_le_bytes()).then_some(summary))
 }
 

@@ -16,6 +16,10 @@
 //! chunk ([`Recording::damage`] lists the losses), and [`recover`] makes an indexed file of it again. Files rewritten
 //! by other programs are read too: compressed by zstd or lz4, or with messages outside of chunks.
 
+// This crate reads what other processes and people wrote: an index or a cast that does not fit is an error there, not
+// a panic or another number.
+#![cfg_attr(not(test), deny(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::indexing_slicing))]
+
 mod chunk;
 mod damage;
 mod error;

@@ -127,7 +127,7 @@ impl Recording {
     }
 
     fn changed(&self, holder: usize, reason: impl Into<String>) -> RecordingError {
-        RecordingError::malformed(&self.path, self.holders[holder].begin, reason)
+        RecordingError::malformed(&self.path, self.holders.get(holder).map_or(0, |holder| holder.begin), reason)
     }
 
     fn messages(&self, holder: usize) -> Result<Messages, RecordingError> {
@@ -135,7 +135,9 @@ impl Recording {
         if let Some((_, messages)) = unpacked.kept.iter().find(|(known, _)| *known == holder) {
             return Ok(Arc::clone(messages));
         }
-        let Holder { begin, len, is_chunk } = self.holders[holder];
+        let Some(&Holder { begin, len, is_chunk }) = self.holders.get(holder) else {
+            return Err(self.changed(holder, "there is no such chunk"));
+        };
         let mut body = vec![0; len];
         let read = self.file.read_exact_at(&mut body, begin + RECORD_HEAD as u64);
         read.map_err(|source| RecordingError::io(&self.path, source))?;
@@ -287,7 +289,7 @@ impl Contents {
         let damage = |lost: &Lost| Damage {
             begin_bytes: lost.begin,
             lost_bytes: lost.end - lost.begin,
-            from_s: self.entries[..lost.before].last().map(seconds),
+            from_s: self.entries.get(..lost.before).and_then(<[Entry]>::last).map(seconds),
             to_s: self.entries.get(lost.before).map(seconds),
             reason: lost.reason.clone(),
         };

@@ -104,11 +104,14 @@ impl<'a> Records<'a> {
         let mut begin = from;
         while begin < self.size {
             let left = self.size - begin;
-            let len = left.min((WINDOW + KNOWN_BY) as u64) as usize;
+            let len = usize::try_from(left).unwrap_or(usize::MAX).min(WINDOW + KNOWN_BY);
             window.resize(len, 0);
             self.file.read_exact_at(&mut window, begin)?;
-            let is_record = |place: &usize| is_record(&window[*place..], left - *place as u64, &is_own);
-            let found = (0..len.min(WINDOW)).filter(|place| is_known(window[*place])).find(is_record);
+            let is_record = |place: &usize| {
+                window.get(*place..).is_some_and(|bytes| is_record(bytes, left - *place as u64, &is_own))
+            };
+            let known = window.iter().take(WINDOW).enumerate().filter(|(_, opcode)| is_known(**opcode));
+            let found = known.map(|(place, _)| place).find(is_record);
             if let Some(place) = found {
                 self.at = begin + place as u64;
                 return Ok(());
@@ -155,7 +158,7 @@ fn is_record(bytes: &[u8], left: u64, is_own: &impl Fn(u16) -> bool) -> bool {
             is_own(channel) && lengths::own_message(payload) == Some(payload_len)
         }),
         op::DATA_END => {
-            len == lengths::DATA_END_LEN as u64 && begins_summary(&body[lengths::DATA_END_LEN.min(body.len())..])
+            len == lengths::DATA_END_LEN as u64 && begins_summary(body.get(lengths::DATA_END_LEN..).unwrap_or_default())
         }
         _ => false,
     }

@@ -70,8 +70,7 @@ pub(super) fn translate(topic: &Topic, capture_nanos: u64, message: &Message) ->
             let objects = truth.agents.iter().flat_map(|agent| &agent.objects).filter(|object| seen.insert(object.id));
             let boxes: Vec<_> = objects
                 .map(|object| Marked {
-                    // ROS has 32 bits for it; larger ids are truncated, which affects viewers only.
-                    id: Some(object.id as i32),
+                    id: Some(marker_id(object.id)),
                     box3d: Box3d {
                         center_m: object.world_from_object.translation_m,
                         size_m: object.size_m,
@@ -217,6 +216,12 @@ fn marker(
     cdr.write_string("");
     cdr.write_sequence_length(0);
     cdr.write_bool(false);
+}
+
+/// ROS has 32 bits for it; larger ids are truncated, which affects viewers only.
+#[expect(clippy::cast_possible_truncation, reason = "wanted")]
+fn marker_id(id: i64) -> i32 {
+    id as i32
 }
 
 #[cfg(test)]

@@ -110,6 +110,7 @@ impl<S: Store> RecordingWriter<S> {
         if self.open.1 > CHUNK_BYTES { self.flush() } else { Ok(()) }
     }
 
+    #[expect(clippy::cast_possible_truncation, reason = "MCAP has 32 bits for the sequence number, which may wrap")]
     fn add(&mut self, key: &Key, arrived_nanos: u64, payload: &[u8]) -> McapResult<()> {
         let header = wire::decode_header([payload]).ok();
         let head = MessageHeader {

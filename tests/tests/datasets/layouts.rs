@@ -15,13 +15,13 @@ use simulator::generate::{SceneLayout, Subset, SynthOptions, generate};
 
 /// Layouts that hold both agents and their boxes, with the layout detected by the reader. A line for each.
 const LAYOUTS: [(SceneLayout, Layout); 7] = [
-    (SceneLayout::Opv2v, Layout::Opv2v),
-    (SceneLayout::V2v4real, Layout::V2v4Real),
-    (SceneLayout::V2xreal, Layout::V2xReal),
-    (SceneLayout::Dair, Layout::Dair),
-    (SceneLayout::V2xseq, Layout::V2xSeq),
-    (SceneLayout::V2xsim, Layout::V2xSim),
-    (SceneLayout::Mars, Layout::Mars),
+    (SceneLayout::Opv2v, Layout::OPV2V),
+    (SceneLayout::V2v4real, Layout::V2V4REAL),
+    (SceneLayout::V2xreal, Layout::V2XREAL),
+    (SceneLayout::Dair, Layout::DAIR),
+    (SceneLayout::V2xseq, Layout::V2XSEQ),
+    (SceneLayout::V2xsim, Layout::V2XSIM),
+    (SceneLayout::Mars, Layout::MARS),
 ];
 /// Methods without and with messages.
 const METHODS: [Method; 2] = [Method::NONE, Method::MAX];

@@ -32,7 +32,7 @@ fn v2xset_scene_is_found_at_every_level() {
     for below in ["", "validate", "validate/2021_08_21_17_30_41"] {
         let dataset = dataset::open(&dir.join(below)).unwrap();
         let scenario = &dataset.scenarios[0];
-        assert_eq!((dataset.layout, dataset.scenarios.len()), (Layout::Opv2v, 1));
+        assert_eq!((dataset.layout, dataset.scenarios.len()), (Layout::OPV2V, 1));
         assert_eq!(scenario.agents.iter().map(|id| id.as_str()).collect::<Vec<_>>(), ["4279", "4288"]);
         assert_eq!(scenario.ticks.iter().map(|tick| tick.stem.as_str()).collect::<Vec<_>>(), ["000069"]);
         // 69 ticks of 0.05 s, as in the protocol of the recording.
@@ -136,7 +136,7 @@ fn voxel_overlap(from: &Frame, other: &Frame, from_other: &nalgebra::Isometry3<f
 #[ignore = "needs V2V_DATA"]
 fn kitti_odometry_motion_and_overlap_are_those_of_the_data() {
     let dataset = open("kitti-odometry-00");
-    assert_eq!((dataset.layout, dataset.scenarios.len()), (Layout::KittiOdometry, 1));
+    assert_eq!((dataset.layout, dataset.scenarios.len()), (Layout::KITTI_ODOMETRY, 1));
     let frames = load_all(&dataset, 0);
     assert_eq!(frames.iter().map(|frame| frame.points.len()).collect::<Vec<_>>(), [124_668, 124_605, 121_618, 121_671]);
     let expected = [([0.859, 0.047, 0.022], 0.40, 0.19), ([0.474, -0.015, 0.009], 0.68, 0.15)];
@@ -156,7 +156,7 @@ fn kitti_odometry_motion_and_overlap_are_those_of_the_data() {
 #[ignore = "needs V2V_DATA"]
 fn kitti_object_boxes_hold_the_points_that_were_counted() {
     let dataset = open("kitti-object");
-    assert_eq!((dataset.layout, dataset.scenarios[0].name.as_str()), (Layout::KittiObject, "training"));
+    assert_eq!((dataset.layout, dataset.scenarios[0].name.as_str()), (Layout::KITTI_OBJECT, "training"));
     let frames = load_all(&dataset, 0);
     assert_eq!(frames.iter().map(|frame| frame.points.len()).collect::<Vec<_>>(), [115_384, 120_268]);
     let counted: Vec<Vec<(ObjectClass, usize)>> = frames
@@ -174,7 +174,7 @@ fn kitti_object_boxes_hold_the_points_that_were_counted() {
 #[ignore = "needs V2V_DATA"]
 fn nclt_raw_scan_is_turned_to_z_up() {
     let dataset = open("nclt");
-    assert_eq!((dataset.layout, dataset.scenarios[0].name.as_str()), (Layout::Nclt, "2012-01-15"));
+    assert_eq!((dataset.layout, dataset.scenarios[0].name.as_str()), (Layout::NCLT, "2012-01-15"));
     let frame = &load_all(&dataset, 0)[0];
     assert_eq!((frame.points.len(), frame.capture_nanos), (23_546, 1_326_652_795_280_148_000));
     let span = |component: usize| {

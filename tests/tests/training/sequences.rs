@@ -76,7 +76,7 @@ fn sequences_of_both_benchmarks_train_and_evaluate_like_any_drive() {
     let drives = drives(folder.path());
     // An encoder serves any town: the second benchmark uses the first one's.
     let mut encoder: Option<PathBuf> = None;
-    for (benchmark, layout) in [(Benchmark::Nclt, Layout::Nclt), (Benchmark::Oxford, Layout::Oxford)] {
+    for (benchmark, layout) in [(Benchmark::Nclt, Layout::NCLT), (Benchmark::Oxford, Layout::OXFORD)] {
         let sequences = write(folder.path(), benchmark, &drives);
         let read = dataset::open(&sequences).unwrap();
         assert_eq!((read.layout, read.problems.len(), read.scenarios.len()), (layout, 0, 2));

@@ -79,6 +79,9 @@ function facts(frame) {
   $("time").textContent = `${number(frame.capture_s, 1)} s`;
   $("method").textContent = frame.method || "–";
   $("latency").textContent = ms(frame.latency_ms);
+  const { answered, ticks, rate_hz: rate } = frame.pace;
+  const share = ticks ? ` (${number(100 * answered / ticks, 0)} %)` : "";
+  $("answered").textContent = `${answered}/${ticks}${share}${rate === null ? "" : `, ${number(rate, 1)} Hz`}`;
   $("detected").textContent = `${frame.detections.length} detected, ${frame.truth.length} there`;
   $("detected").title = "boxes detected; all that vehicles annotate, in range or not";
 }
@@ -96,7 +99,7 @@ function panels(frame) {
     ms(link.clock_ms),
     number(link.trust, 2),
     link.is_fused ? "fused" : [[link.skipped || "silent", link.misbehaviour].filter(Boolean).map(words).join(": "), "bad"],
-  ]), "Nobody sends to the ego.");
+  ]), "No neighbour sends to the ego.");
   stages(frame);
   table("messages", ["topic", "sent", "used", "dropped"], messageRows(frame.messages), "Nothing counted yet.");
   const rows = frame.processes.flatMap((process) =>

@@ -163,7 +163,7 @@ impl Arguments {
                 .map_err(|error| BadInput::new(format!("{}: {error}", folder.display())))
                 .context("datasets")?;
         }
-        let rule = self.protocol.resolve(Layout::Opv2v).map_err(BadInput::new)?.ground_truth;
+        let rule = self.protocol.resolve(Layout::OPV2V).map_err(BadInput::new)?.ground_truth;
         let samples = SampleConfig {
             augmentation: Augmentation { turn_rad: self.turn.to_radians(), ..Augmentation::default() },
             drop_neighbour: self.drop_neighbour,

@@ -23,8 +23,8 @@ pub(super) enum Kind {
 impl Kind {
     pub(super) fn layout(self) -> Layout {
         match self {
-            Self::Dair => Layout::Dair,
-            Self::V2xSeq => Layout::V2xSeq,
+            Self::Dair => Layout::DAIR,
+            Self::V2xSeq => Layout::V2XSEQ,
         }
     }
 

@@ -129,6 +129,7 @@ fn check_size(field: &Field<'_>, size_m: [f64; 3]) -> Result<[f64; 3], ReadError
 /// Pose and size of a box from its corners: four of the bottom, in order around it from the front, then those above
 /// them. The edge from the third and fourth corner to the second and first points ahead; the first may be on either
 /// side.
+#[expect(clippy::indexing_slicing, reason = "24 numbers are 8 corners")]
 fn from_corners(field: &Field<'_>) -> Result<Option<(Pose, [f64; 3])>, ReadError> {
     let numbers = field.numbers::<24>()?;
     let (corners, _) = numbers.as_chunks::<3>();
@@ -161,6 +162,7 @@ fn from_corners(field: &Field<'_>) -> Result<Option<(Pose, [f64; 3])>, ReadError
 ///
 /// The two sides are labelled independently. Of several candidates the one with the largest overlap is used; each id is
 /// given once.
+#[expect(clippy::indexing_slicing, reason = "indices of the lists that they were taken from")]
 pub(super) fn share_ids(objects: &mut [Object], others: &[Object], lidar_from_world: &Isometry3<f64>) {
     let footprint = |object: &Object| {
         let corners = upright_box(object, lidar_from_world).corners();

@@ -23,11 +23,32 @@ use protocol::{CavId, Handedness};
 
 use self::index::{Index, Kind, Pair};
 use self::labels::{Block, Objects};
+use super::layouts::{LayoutRow, Reader};
 use super::points::{SweepStorage, Sweeps};
 use super::presence::Absences;
 use super::{Dataset, FrameSource, MissingFrame, OpenOptions, Problem, ReadError, Scenario, Tick, files, roots};
 use crate::frame::{Frame, Object};
 use crate::pcd::PcdCloud;
+
+/// DAIR-V2X-C: one vehicle and one roadside unit, JSON per frame.
+pub(crate) static DAIR: LayoutRow = LayoutRow {
+    key: "dair",
+    name: "DAIR-V2X",
+    data_sets: "DAIR-V2X-C",
+    files: "cooperative/data_info.json with vehicle_pointcloud_path, vehicle-side/, infrastructure-side/",
+    protocol: "dair",
+    reader: Some(Reader::DataSet(open)),
+};
+
+/// V2X-Seq (SPD): DAIR-V2X as sequences with track ids.
+pub(crate) static V2XSEQ: LayoutRow = LayoutRow {
+    key: "v2x_seq",
+    name: "V2X-Seq",
+    data_sets: "V2X-Seq-SPD",
+    files: "cooperative/data_info.json with vehicle_frame, vehicle-side/, infrastructure-side/",
+    protocol: "v2xseq",
+    reader: None,
+};
 
 const VEHICLE_SIDE: &str = "vehicle-side";
 const INFRASTRUCTURE_SIDE: &str = "infrastructure-side";

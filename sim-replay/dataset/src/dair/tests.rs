@@ -167,7 +167,7 @@ fn frames(scenario: &Scenario, tick: usize) -> Vec<Frame> {
 fn a_pair_is_a_tick_with_the_poses_of_both_sides() {
     let set = DataSet::new(Kind::Dair);
     let dataset = set.open();
-    assert_eq!((dataset.layout, dataset.problems.len()), (Layout::Dair, 0));
+    assert_eq!((dataset.layout, dataset.problems.len()), (Layout::DAIR, 0));
     let scenario = &dataset.scenarios[0];
     assert_eq!((dataset.scenarios.len(), scenario.name.as_str()), (1, "batch_7"));
     assert_eq!(scenario.agents.iter().map(CavId::as_str).collect::<Vec<_>>(), ["vehicle", "infrastructure"]);
@@ -222,7 +222,7 @@ fn without_cooperative_labels_both_sides_count_and_common_objects_once() {
 fn sequences_have_track_ids_and_their_offset_in_the_frame_of_the_vehicle() {
     let set = DataSet::new(Kind::V2xSeq);
     let dataset = set.open();
-    assert_eq!((dataset.layout, dataset.problems.len()), (Layout::V2xSeq, 0));
+    assert_eq!((dataset.layout, dataset.problems.len()), (Layout::V2XSEQ, 0));
     let scenario = &dataset.scenarios[0];
     assert_eq!((scenario.name.as_str(), scenario.ticks.len()), ("sequence_0003", 2));
     let frames = frames(scenario, 1);
@@ -341,7 +341,7 @@ fn it_is_found_from_its_root_and_from_above_and_parts_point_to_it() {
     assert_eq!(above.scenarios[0].name, "cooperative-vehicle-infrastructure/batch_7");
     let renamed = set.dir.path().join("any name");
     fs::rename(&set.root, &renamed).unwrap();
-    assert_eq!(crate::open(&renamed).unwrap().layout, Layout::Dair);
+    assert_eq!(crate::open(&renamed).unwrap().layout, Layout::DAIR);
     let error = crate::open(&renamed.join("vehicle-side")).unwrap_err().to_string();
     assert!(error.ends_with(&format!("this is a part of a DAIR-V2X data set: open {}", renamed.display())), "{error}");
 }

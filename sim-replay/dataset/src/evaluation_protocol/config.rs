@@ -3,7 +3,7 @@
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use super::{AgentKinds, ApOrder, EgoKind, EvaluationProtocol, PRESETS, preset_of_layout};
+use super::{AgentKinds, ApOrder, EgoKind, EvaluationProtocol, PRESETS};
 use crate::Layout;
 use crate::class_set::ClassSet;
 
@@ -56,7 +56,7 @@ impl ProtocolConfig {
     /// # Errors
     /// A message with the option and both values.
     pub fn resolve(&self, layout: Layout) -> Result<EvaluationProtocol, String> {
-        let name = self.preset.as_deref().unwrap_or(preset_of_layout(layout));
+        let name = self.preset.as_deref().unwrap_or(layout.0.protocol);
         let mut protocol = EvaluationProtocol::preset(name).ok_or_else(|| {
             let known: Vec<&str> = PRESETS.iter().map(|(name, _)| *name).collect();
             format!("unknown protocol {name:?}; there are {}", known.join(", "))

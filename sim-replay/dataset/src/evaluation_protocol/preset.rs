@@ -1,7 +1,6 @@
 //! Presets: the protocols of the supported data sets, with their sources.
 
 use super::{AgentKinds, ApOrder, EgoKind, EvaluationProtocol};
-use crate::Layout;
 use crate::class_set::ClassSet;
 use crate::ground_truth::GroundTruthRule;
 
@@ -22,20 +21,6 @@ pub const PRESETS: [(&str, &str); 14] = [
     ("rcooper", "RCooper, in the layouts of its public converters"),
     ("mars", "Open MARS, multi-agent subset"),
 ];
-
-/// The default preset of a layout.
-#[must_use]
-pub(crate) fn preset_of_layout(layout: Layout) -> &'static str {
-    match layout {
-        Layout::V2v4Real => "v2v4real",
-        Layout::V2xReal => "v2xreal",
-        Layout::Dair => "dair",
-        Layout::V2xSeq => "v2xseq",
-        Layout::V2xSim => "v2xsim",
-        Layout::Mars => "mars",
-        _ => "opv2v",
-    }
-}
 
 /// The preset of that name.
 pub(super) fn preset(name: &str) -> Option<EvaluationProtocol> {

@@ -25,7 +25,7 @@ fn scenario(root: &Path) -> Scenario {
 
 fn arranged(config: ProtocolConfig) -> Option<(Vec<String>, usize, Vec<usize>)> {
     let dir = tempfile::tempdir().unwrap();
-    let arranged = config.resolve(Layout::Opv2v).unwrap().arrange(&scenario(dir.path()))?;
+    let arranged = config.resolve(Layout::OPV2V).unwrap().arrange(&scenario(dir.path()))?;
     let agents = arranged.agents.iter().map(ToString::to_string).collect();
     let present = (0..arranged.ticks.len()).map(|tick| arranged.present_agents(tick).count()).collect();
     Some((agents, arranged.ticks.len(), present))
@@ -48,8 +48,8 @@ fn every_preset_has_a_protocol_of_its_name() {
 #[test]
 fn the_layout_decides_without_options() {
     let resolve = |layout| ProtocolConfig::default().resolve(layout).unwrap();
-    assert_eq!(resolve(Layout::Opv2v).ground_truth, GroundTruthRule::OPV2V);
-    let v2v4real = resolve(Layout::V2v4Real);
+    assert_eq!(resolve(Layout::OPV2V).ground_truth, GroundTruthRule::OPV2V);
+    let v2v4real = resolve(Layout::V2V4REAL);
     assert_eq!((v2v4real.ground_truth, v2v4real.ap_order), (GroundTruthRule::V2V4REAL, ApOrder::Frame));
 }
 
@@ -59,7 +59,7 @@ fn single_options_change_the_preset() {
         r#"{"preset": "dair", "comm_range_m": 80, "classes": ["car"], "ground_truth_range_m": [0, -1, -2, 1, 2, 3]}"#,
     )
     .unwrap();
-    let protocol = config.resolve(Layout::Opv2v).unwrap();
+    let protocol = config.resolve(Layout::OPV2V).unwrap();
     let rule = protocol.rule_within([-10.0, -10.0, -1.0, 10.0, 10.0, 1.0]);
     assert_eq!((rule.x_m, rule.y_m, rule.z_m), ([0.0, 1.0], [-1.0, 2.0], [-2.0, 3.0]), "asked for, so not cut");
     assert_eq!((rule.comm_range_m, rule.classes), (80.0, "car".parse::<ClassSet>().unwrap()));
@@ -68,14 +68,14 @@ fn single_options_change_the_preset() {
 
 #[test]
 fn the_range_of_a_preset_ends_with_the_area_of_the_network() {
-    let rule = ProtocolConfig::default().resolve(Layout::Opv2v).unwrap();
+    let rule = ProtocolConfig::default().resolve(Layout::OPV2V).unwrap();
     let rule = rule.rule_within([-51.2, -38.4, -5.0, 51.2, 38.4, 0.5]);
     assert_eq!((rule.x_m, rule.y_m, rule.z_m), ([-51.2, 51.2], [-38.4, 38.4], [-3.0, 0.5]));
 }
 
 #[test]
 fn wrong_options_are_named_with_both_values() {
-    let error = |json: &str| serde_json::from_str::<ProtocolConfig>(json).unwrap().resolve(Layout::Opv2v).unwrap_err();
+    let error = |json: &str| serde_json::from_str::<ProtocolConfig>(json).unwrap().resolve(Layout::OPV2V).unwrap_err();
     assert!(error(r#"{"preset": "kitty"}"#).starts_with("unknown protocol \"kitty\"; there are opv2v,"));
     assert_eq!(error(r#"{"min_corners": 9}"#), "min_corners: 9, expected 1 to 8");
     assert_eq!(error(r#"{"comm_range_m": -1}"#), "comm_range_m: -1, expected 0 to 100000");
@@ -102,7 +102,7 @@ fn a_scenario_without_agents_of_the_kind_is_left_out() {
     agent(dir.path(), "1", 0..2);
     let scenario = crate::open(dir.path()).unwrap().scenarios.remove(0);
     let units = ProtocolConfig { agents: Some(AgentKinds::Units), ..ProtocolConfig::default() };
-    assert!(units.resolve(Layout::Opv2v).unwrap().arrange(&scenario).is_none());
+    assert!(units.resolve(Layout::OPV2V).unwrap().arrange(&scenario).is_none());
 }
 
 #[test]

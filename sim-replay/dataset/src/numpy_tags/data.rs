@@ -81,13 +81,17 @@ pub(super) fn numbers(field: &Field<'_>, dtype: Dtype, count: usize) -> Result<V
 
 impl Dtype {
     /// Decodes `bytes`, whose length is the size, at most 8.
+    #[expect(
+        clippy::cast_possible_truncation,
+        reason = "numbers of two and four bytes fill the lower ones; a size is at most 8"
+    )]
     fn number(self, bytes: &[u8]) -> f64 {
         let mut little = [0; 8];
         for (place, byte) in little.iter_mut().zip(bytes) {
             *place = *byte;
         }
         if self.is_big_endian {
-            little[..self.size].reverse();
+            little.iter_mut().take(self.size).rev().zip(bytes).for_each(|(place, byte)| *place = *byte);
         }
         let bits = u64::from_le_bytes(little);
         match (self.kind, self.size) {

@@ -203,7 +203,8 @@ fn row_major(shape: &[usize], values: &[f64]) -> Vec<f64> {
         }
         place
     };
-    (0..values.len()).map(|index| values[place(index)]).collect()
+    // Every place is below the product of the sizes, the number of values.
+    (0..values.len()).map(|index| values.get(place(index)).copied().unwrap_or(f64::NAN)).collect()
 }
 
 #[cfg(test)]

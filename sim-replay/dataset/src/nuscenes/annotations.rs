@@ -115,6 +115,7 @@ fn object(row: &Field<'_>, instances: &HashMap<String, Instance>) -> Result<Obje
 
 /// The objects that a sweep hits with at least one point. An object with the LiDAR inside or on its roof is the vehicle
 /// that carries it: a vehicle does not list itself.
+#[expect(clippy::indexing_slicing, reason = "axes of vectors of three")]
 pub(super) fn seen<'a>(
     objects: &'a [Object],
     points: &PointCloud,
@@ -131,6 +132,7 @@ pub(super) fn seen<'a>(
     })
 }
 
+#[expect(clippy::indexing_slicing, reason = "axes of vectors of three")]
 fn is_hit(points: &[[f32; 4]], object_from_lidar: &Isometry3<f64>, half_m: [f64; 3]) -> bool {
     let center = object_from_lidar.inverse().translation.vector;
     let reach_m2 = half_m.iter().map(|half| half * half).sum::<f64>();

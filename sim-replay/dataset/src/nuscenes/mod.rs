@@ -20,11 +20,42 @@ use protocol::{CavId, Handedness};
 
 use self::rig::QuarterTurns;
 use self::tables::{Sample, Scene, Sweep, Tables};
+use super::layouts::{LayoutRow, Reader};
 use super::points::{SweepStorage, Sweeps};
 use super::presence::Absences;
 use super::{Dataset, FrameSource, Layout, MissingFrame, OpenOptions, ReadError, Scenario, Tick, files, roots};
 use crate::frame::{Frame, Object, ObjectClass};
 use crate::pcd::PcdCloud;
+
+/// V2X-Sim 2.0: nuScenes tables and sweeps of several agents.
+pub(crate) static V2XSIM: LayoutRow = LayoutRow {
+    key: "v2x_sim",
+    name: "V2X-Sim",
+    data_sets: "V2X-Sim 2.0",
+    files: "<version>/sample.json and sample_data.json (nuScenes tables), a LiDAR LIDAR_TOP_id_<agent>",
+    protocol: "v2xsim",
+    reader: Some(Reader::DataSet(open)),
+};
+
+/// Open MARS: nuScenes tables of several vehicles.
+pub(crate) static MARS: LayoutRow = LayoutRow {
+    key: "mars",
+    name: "Open MARS",
+    data_sets: "Open MARS",
+    files: "<version>/sample.json and sample_data.json (nuScenes tables), a LiDAR LIDAR_FRONT_CENTER or LIDAR_FRONT_CENTER_<vehicle>",
+    protocol: "mars",
+    reader: None,
+};
+
+/// nuScenes: tables of one vehicle.
+pub(crate) static NUSCENES: LayoutRow = LayoutRow {
+    key: "nu_scenes",
+    name: "nuScenes",
+    data_sets: "nuScenes",
+    files: "<version>/sample.json and sample_data.json (nuScenes tables), the LiDAR LIDAR_TOP",
+    protocol: "opv2v",
+    reader: None,
+};
 
 /// Tables that identify the layout: a folder with these is a version of a data set.
 const TABLES: [&str; 2] = ["sample.json", "sample_data.json"];
@@ -208,7 +239,7 @@ impl Builder<'_> {
         problems: &mut Vec<ReadError>,
     ) -> Vec<u64> {
         let micros: Vec<u64> = moments.iter().map(|(sample, _)| sample.micros).collect();
-        if micros.windows(2).all(|pair| pair[0] < pair[1]) {
+        if micros.array_windows().all(|[a, b]| a < b) {
             let start = micros.first().copied().unwrap_or(0);
             return micros.iter().map(|micros| (micros - start).saturating_mul(1000)).collect();
         }
@@ -261,7 +292,7 @@ impl Source {
 
     /// V2X-Sim classifies all wheeled objects as vehicles.
     fn with_class(&self, object: &Object) -> Object {
-        let is_narrow = self.layout == Layout::V2xSim && object.size_m[1] <= TWO_WHEELER_WIDTH_M;
+        let is_narrow = self.layout == Layout::V2XSIM && object.size_m[1] <= TWO_WHEELER_WIDTH_M;
         let class = if is_narrow && object.class.is_vehicle() { ObjectClass::TwoWheeler } else { object.class };
         Object { class, ..object.clone() }
     }

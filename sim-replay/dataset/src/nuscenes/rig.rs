@@ -13,17 +13,17 @@ const ONLY_AGENT: &str = "0";
 /// The layout with this naming of channels, and the name of the agent; nothing for LiDARs that are not read.
 pub(super) fn agent_of(channel: &str) -> Option<(Layout, &str)> {
     if let Some(agent) = channel.strip_prefix("LIDAR_TOP_id_") {
-        return Some((Layout::V2xSim, agent));
+        return Some((Layout::V2XSIM, agent));
     }
     if let Some(vehicle) = channel.strip_prefix("LIDAR_FRONT_CENTER") {
-        return Some((Layout::Mars, vehicle.strip_prefix('_').unwrap_or(ONLY_AGENT)));
+        return Some((Layout::MARS, vehicle.strip_prefix('_').unwrap_or(ONLY_AGENT)));
     }
-    (channel == "LIDAR_TOP").then_some((Layout::NuScenes, ONLY_AGENT))
+    (channel == "LIDAR_TOP").then_some((Layout::NUSCENES, ONLY_AGENT))
 }
 
 /// True for roadside units: number 0 of V2X-Sim, and negative numbers as in other layouts.
 pub(super) fn is_roadside_unit(layout: Layout, agent: &str) -> bool {
-    (layout == Layout::V2xSim && agent == "0") || agent.starts_with('-')
+    (layout == Layout::V2XSIM && agent == "0") || agent.starts_with('-')
 }
 
 /// Quarter turns, counter-clockwise, that bring the axes of a LiDAR to x forward: nuScenes mounts its own with y
@@ -33,6 +33,7 @@ pub(super) struct QuarterTurns(u8);
 
 impl QuarterTurns {
     /// The turns that bring x nearest to the vehicle's.
+    #[expect(clippy::cast_possible_truncation, reason = "0 to 3 turns")]
     pub(super) fn to_forward(vehicle_from_lidar: &Isometry3<f64>) -> Self {
         let x = vehicle_from_lidar.rotation * Vector3::x();
         let turns = (x.y.atan2(x.x) / FRAC_PI_2).round() as i64;
@@ -67,10 +68,10 @@ mod tests {
 
     #[test]
     fn channels_name_layout_and_agent() {
-        assert_eq!(agent_of("LIDAR_TOP_id_3"), Some((Layout::V2xSim, "3")));
-        assert_eq!(agent_of("LIDAR_FRONT_CENTER_maisy"), Some((Layout::Mars, "maisy")));
-        assert_eq!(agent_of("LIDAR_FRONT_CENTER"), Some((Layout::Mars, "0")));
-        assert_eq!(agent_of("LIDAR_TOP"), Some((Layout::NuScenes, "0")));
+        assert_eq!(agent_of("LIDAR_TOP_id_3"), Some((Layout::V2XSIM, "3")));
+        assert_eq!(agent_of("LIDAR_FRONT_CENTER_maisy"), Some((Layout::MARS, "maisy")));
+        assert_eq!(agent_of("LIDAR_FRONT_CENTER"), Some((Layout::MARS, "0")));
+        assert_eq!(agent_of("LIDAR_TOP"), Some((Layout::NUSCENES, "0")));
         assert_eq!(agent_of("LIDAR_FRONT_LEFT"), None);
     }
 

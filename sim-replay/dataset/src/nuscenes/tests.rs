@@ -176,7 +176,7 @@ fn load(scenario: &Scenario, tick: usize) -> Vec<Frame> {
 #[test]
 fn v2x_sim_has_numbered_vehicles_and_a_roadside_unit() {
     let dataset = v2x_sim().open();
-    assert_eq!((dataset.layout, dataset.problems.len()), (Layout::V2xSim, 0), "{:?}", dataset.problems);
+    assert_eq!((dataset.layout, dataset.problems.len()), (Layout::V2XSIM, 0), "{:?}", dataset.problems);
     let scenario = &dataset.scenarios[0];
     assert_eq!(scenario.name, "v1.0-mini/scene_5");
     assert_eq!(scenario.agents.iter().map(CavId::as_str).collect::<Vec<_>>(), ["1", "2", "0"]);
@@ -241,7 +241,7 @@ fn mars_names_its_vehicles_and_has_no_annotations() {
     let rigs = [rig("LIDAR_FRONT_CENTER_maisy", 20.0), rig("LIDAR_FRONT_CENTER_mike", -146.0)];
     let set = DataSet::new("v1.0", &rigs, &[]);
     let dataset = set.open();
-    assert_eq!((dataset.layout, dataset.problems.len()), (Layout::Mars, 0), "{:?}", dataset.problems);
+    assert_eq!((dataset.layout, dataset.problems.len()), (Layout::MARS, 0), "{:?}", dataset.problems);
     let scenario = &dataset.scenarios[0];
     assert_eq!(
         scenario.agents.iter().map(CavId::as_str).collect::<Vec<_>>(),
@@ -273,7 +273,7 @@ fn nuscenes_is_turned_so_that_x_points_ahead() {
     let set =
         DataSet::new("v1.0-mini", &[rig], &[("vehicle.bus.rigid", place([110.5, 199.0, 1.5], [3.0, 12.0, 3.0], 0.0))]);
     let dataset = set.open();
-    assert_eq!((dataset.layout, dataset.scenarios[0].agents[0].as_str()), (Layout::NuScenes, "0"));
+    assert_eq!((dataset.layout, dataset.scenarios[0].agents[0].as_str()), (Layout::NUSCENES, "0"));
     let frame = &load(&dataset.scenarios[0], 0)[0];
     assert_eq!(frame.points.xyzi, [[10.0, -1.0, -1.25, 0.5]]);
     assert!(frame.world_from_lidar.unwrap().yaw_rad().abs() < 1e-9);

@@ -63,7 +63,7 @@ fn a_frame_is_mirrored_as_a_whole() {
     let dir = tempfile::tempdir().unwrap();
     write_frame(dir.path(), "1/000070", YAML, &[[1.0, 2.0, 3.0, 0.5]]);
     let scenario = opened(dir.path());
-    assert_eq!((scenario.layout, scenario.source_handedness), (Layout::Opv2v, Handedness::Left));
+    assert_eq!((scenario.layout, scenario.source_handedness), (Layout::OPV2V, Handedness::Left));
     let frame = scenario.load(0, 0, &LoadOptions::default()).unwrap();
     assert_eq!(frame.points.xyzi, [[1.0, -2.0, 3.0, 0.5]]);
     let lidar = frame.world_from_lidar.unwrap();
@@ -247,7 +247,7 @@ fn a_matrix_beside_six_numbers_is_named() {
     let other = YAML.replace("lidar_pose: [10, 20, 2, 0, 90, 1e-06]", matrix);
     write_frame(dir.path(), "2/000070", &other, &[]);
     let scenario = opened(dir.path());
-    assert_eq!(scenario.layout, Layout::Opv2v);
+    assert_eq!(scenario.layout, Layout::OPV2V);
     let error = scenario.load(1, 0, &LoadOptions::default()).unwrap_err().to_string();
     assert!(error.contains("2/000070.yaml:3: lidar_pose: a 4x4 matrix as in V2V4Real"), "{error}");
 }
@@ -314,7 +314,7 @@ fn bare_floats_beside_yaml_are_v2x_real_and_nothing_is_mirrored() {
         }
     }
     let scenario = opened(dir.path());
-    assert_eq!((scenario.layout, scenario.source_handedness), (Layout::V2xReal, Handedness::Right));
+    assert_eq!((scenario.layout, scenario.source_handedness), (Layout::V2XREAL, Handedness::Right));
     assert_eq!((scenario.ticks.len(), scenario.agents.last().unwrap().as_str()), (2, "-1"));
     let frame = scenario.load(2, 1, &LoadOptions::default()).unwrap();
     assert_eq!(frame.points.xyzi, [[1.0, 2.0, 3.0, 0.5], [4.0, 5.0, 6.0, 0.25]]);

@@ -72,13 +72,19 @@ impl<'a> Lines<'a> {
         self.begun = self.rest;
         let (mut point, mut label) = ([0.0; 4], 0);
         for (index, field) in self.header.fields.iter().enumerate() {
+            let column = self.columns.get(index).copied().unwrap_or(Column::Ignored);
             for _ in 0..field.count {
                 if self.is_at_end_of_line() {
                     return Err(self.wrong_count());
                 }
-                match self.columns[index] {
+                match column {
                     Column::Ignored => drop(self.token()),
-                    Column::Component(component) => point[component] = self.float(index)?,
+                    Column::Component(component) => {
+                        let value = self.float(index)?;
+                        if let Some(place) = point.get_mut(component) {
+                            *place = value;
+                        }
+                    }
                     colour => (point[3], label) = self.colour(colour, index)?,
                 }
             }
@@ -107,7 +113,7 @@ impl<'a> Lines<'a> {
 
     fn float(&mut self, field: usize) -> Result<f32, PcdError> {
         if let Some((number, len)) = ordinary(self.rest) {
-            self.rest = &self.rest[len..];
+            self.rest = self.rest.get(len..).unwrap_or_default();
             return Ok(number);
         }
         let token = self.token();
@@ -115,6 +121,7 @@ impl<'a> Lines<'a> {
     }
 
     /// Red and green of a packed colour.
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "the low 32 bits are the colour")]
     fn colour(&mut self, column: Column, field: usize) -> Result<(f32, u8), PcdError> {
         let token = self.token();
         if let Some(colour) = self.colours.find(token) {
@@ -139,7 +146,8 @@ impl<'a> Lines<'a> {
 
     fn no_number(&self, field: usize, token: &[u8]) -> PcdError {
         let token: String = String::from_utf8_lossy(token).chars().take(40).collect();
-        PcdError::at(self.line, &self.header.fields[field].name, format!("{token:?} is no number"))
+        let name = self.header.fields.get(field).map_or("", |field| &field.name);
+        PcdError::at(self.line, name, format!("{token:?} is no number"))
     }
 
     /// The line has fewer or more values than the header states. They are counted from its start.
@@ -190,16 +198,19 @@ impl Default for Colours {
 impl Colours {
     fn find(&self, token: &[u8]) -> Option<(f32, u8)> {
         let (key, slot) = Self::place(token)?;
-        let (kept, colour) = self.0[slot];
+        let (kept, colour) = *self.0.get(slot)?;
         (kept == key).then_some(colour)
     }
 
     fn keep(&mut self, token: &[u8], colour: (f32, u8)) {
-        if let Some((key, slot)) = Self::place(token) {
-            self.0[slot] = (key, colour);
+        if let Some((key, slot)) = Self::place(token)
+            && let Some(place) = self.0.get_mut(slot)
+        {
+            *place = (key, colour);
         }
     }
 
+    #[expect(clippy::cast_possible_truncation, reason = "a hash of both halves")]
     fn place(token: &[u8]) -> Option<(u128, usize)> {
         let mut bytes = [0; 16];
         bytes.get_mut(..token.len())?.copy_from_slice(token);

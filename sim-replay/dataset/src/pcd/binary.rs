@@ -25,11 +25,7 @@ pub(super) fn decode(header: &Header, body: &[u8]) -> Result<PcdCloud, PcdError>
         );
         return Err(PcdError::of("POINTS", reason));
     }
-    let column = |index: usize| {
-        let first = header.fields[..index].iter().map(|field| field.size * field.count).sum();
-        column_of(&header.fields[index], first, stride)
-    };
-    Ok(gather(header, body, column))
+    Ok(gather(header, body, |field, first| column_of(field, first, stride)))
 }
 
 /// Two lengths, then LZF; once unpacked, fields one after another, each for all points.
@@ -53,20 +49,21 @@ pub(super) fn decode_compressed(header: &Header, body: &[u8]) -> Result<PcdCloud
         return Err(PcdError::of("DATA", reason));
     }
     let unpacked = lzf::decompress(packed, unpacked_len).map_err(|error| PcdError::of("DATA", error.to_string()))?;
-    let column = |index: usize| {
-        let field = &header.fields[index];
-        let first: usize = header.fields[..index].iter().map(|field| field.size * field.count).sum();
-        column_of(field, first * points, field.size * field.count)
-    };
-    Ok(gather(header, &unpacked, column))
+    Ok(gather(header, &unpacked, |field, first| column_of(field, first * points, field.size * field.count)))
 }
 
 fn column_of(field: &Field, first: usize, step: usize) -> Column {
     Column { first, step, kind: field.kind, size: field.size }
 }
 
-/// `data` holds every number that `column` points at: its length has been checked.
-fn gather(header: &Header, data: &[u8], column: impl Fn(usize) -> Column) -> PcdCloud {
+/// `column` gives the place of a field from the bytes of a point before it. `data` holds every number that it points
+/// at: its length has been checked.
+#[expect(clippy::indexing_slicing, reason = "the header's indices are of its fields")]
+fn gather(header: &Header, data: &[u8], column: impl Fn(&Field, usize) -> Column) -> PcdCloud {
+    let column = |index: usize| {
+        let before = header.fields[..index].iter().map(|field| field.size * field.count).sum();
+        column(&header.fields[index], before)
+    };
     let mut points = vec![[0.0; 4]; header.points];
     for (component, index) in header.xyz.into_iter().enumerate() {
         column(index).fill(data, &mut points, component);
@@ -90,6 +87,7 @@ fn gather(header: &Header, data: &[u8], column: impl Fn(usize) -> Column) -> Pcd
 
 impl Column {
     /// Sets one component of all points. Integers beyond 2^24 and doubles are rounded.
+    #[expect(clippy::cast_possible_truncation, reason = "rounded to f32")]
     fn fill(self, data: &[u8], points: &mut [[f32; 4]], component: usize) {
         match (self.kind, self.size) {
             (Kind::Float, 4) => self.numbers(data, points, component, f32::from_le_bytes),
@@ -108,6 +106,7 @@ impl Column {
         }
     }
 
+    #[expect(clippy::indexing_slicing, reason = "a component is 0 to 3")]
     fn numbers<const N: usize>(
         self,
         data: &[u8],

@@ -68,6 +68,7 @@ pub fn encode(cloud: &PointCloud, encoding: Encoding, intensity: IntensityField<
     }
 }
 
+#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a cast from a float saturates")]
 fn red_byte(intensity: f32) -> u32 {
     // NaN becomes 0.
     (intensity.clamp(0.0, 1.0) * 255.0).round() as u32

@@ -118,8 +118,9 @@ impl Header {
             let Some(end) = rest.iter().take(MAX_LINE).position(|&byte| byte == b'\n') else {
                 return Err(PcdError::at(line, "DATA", "the header ends before a DATA line"));
             };
-            entries.add(line, without_comment(&rest[..end]))?;
-            rest = &rest[end + 1..];
+            let (text, after) = rest.split_at(end);
+            entries.add(line, without_comment(text))?;
+            rest = after.strip_prefix(b"\n").unwrap_or(after);
         }
         Ok((Self::from_entries(&entries, line)?, rest))
     }
@@ -150,9 +151,9 @@ impl Header {
     /// Name and number type of the field from which intensity is read.
     pub(super) fn intensity_origin(&self) -> Option<(&str, IntensityKind)> {
         match self.intensity {
-            IntensitySource::Red(index) => Some((&self.fields[index].name, IntensityKind::RedByte)),
+            IntensitySource::Red(index) => Some((&self.fields.get(index)?.name, IntensityKind::RedByte)),
             IntensitySource::Value(index) => {
-                let field = &self.fields[index];
+                let field = self.fields.get(index)?;
                 let is_byte = field.kind == Kind::Unsigned && field.size == 1;
                 Some((&field.name, if is_byte { IntensityKind::Byte } else { IntensityKind::Number }))
             }
@@ -161,6 +162,7 @@ impl Header {
     }
 
     /// The fields that are read must be numbers; of all others only the size is needed.
+    #[expect(clippy::indexing_slicing, reason = "indices of the fields, of which each has one type")]
     fn check_formats(&self, entries: &Entries<'_>) -> Result<(), PcdError> {
         let intensity = match self.intensity {
             IntensitySource::Value(index) | IntensitySource::Red(index) => Some(index),
@@ -190,8 +192,9 @@ impl Header {
 
 /// A header line as text. Comments may be in any encoding.
 fn without_comment(line: &[u8]) -> &[u8] {
-    let starts_comment = |at: &usize| line[*at] == b'#' && (*at == 0 || line[*at - 1].is_ascii_whitespace());
-    &line[..(0..line.len()).find(starts_comment).unwrap_or(line.len())]
+    let before = std::iter::once(&b' ').chain(line);
+    let begin = line.iter().zip(before).position(|(&byte, before)| byte == b'#' && before.is_ascii_whitespace());
+    begin.and_then(|begin| line.get(..begin)).unwrap_or(line)
 }
 
 impl<'a> Entries<'a> {
@@ -251,6 +254,7 @@ impl<'a> Entries<'a> {
         Err(PcdError::at(entry.line, key, format!("{} values for {fields} FIELDS", entry.values.len())))
     }
 
+    #[expect(clippy::indexing_slicing, reason = "as many sizes, types and counts as names")]
     fn fields(&self) -> Result<Vec<Field>, PcdError> {
         let names = self.get("FIELDS")?;
         if names.values.is_empty() || names.values.len() > MAX_FIELDS {

@@ -48,6 +48,7 @@ fn literals<'a>(output: &mut Vec<u8>, input: &'a [u8], count: usize) -> Result<&
     Ok(rest)
 }
 
+#[expect(clippy::indexing_slicing, reason = "`at` is below the growing length: it begins `distance` before it")]
 fn repeat<'a>(output: &mut Vec<u8>, input: &'a [u8], control: usize) -> Result<&'a [u8], LzfError> {
     let mut next = input.iter();
     let mut byte = || next.next().map(|&byte| usize::from(byte)).ok_or(LzfError::CutOff);

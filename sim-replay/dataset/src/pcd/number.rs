@@ -52,6 +52,7 @@ pub(super) fn ordinary(text: &[u8]) -> Option<(f32, usize)> {
 }
 
 /// The value if `f64` determines it exactly.
+#[expect(clippy::cast_possible_truncation, reason = "rounded to f32")]
 fn exact(is_negative: bool, mantissa: u64, exponent: i32) -> Option<f32> {
     if mantissa >= 1 << 53 {
         return None;

@@ -90,7 +90,7 @@ impl FloatForm {
     pub(super) fn points(self, bytes: &[u8]) -> PcdCloud {
         let (numbers, _) = bytes.as_chunks::<4>();
         let points = numbers.chunks_exact(self.numbers());
-        let points = points.map(|point| [0, 1, 2, 3].map(|index| f32::from_le_bytes(point[index]))).collect();
+        let points = points.filter_map(|point| Some(point.first_chunk()?.map(f32::from_le_bytes))).collect();
         let intensity = Some(IntensityOrigin::stored("4th float", IntensityKind::Number));
         PcdCloud { intensity, form: self.name(), ..PcdCloud::of_finite(points, Vec::new()) }
     }
@@ -107,14 +107,14 @@ fn absurd(numbers: &[f32]) -> Option<String> {
 /// True if every fifth number is a laser index, and not all numbers could be.
 fn has_lasers(numbers: &[f32]) -> bool {
     let is_laser = |number: f32| (0.0..=255.0).contains(&number) && number.fract() == 0.0;
-    let lasers = numbers.chunks_exact(5).filter(|point| is_laser(point[4])).count();
+    let lasers = numbers.as_chunks().0.iter().filter(|[.., laser]: &&[f32; 5]| is_laser(*laser)).count();
     lasers as f64 >= LASER_SHARE * (numbers.len() / 5) as f64 && numbers.iter().any(|number| number.fract() != 0.0)
 }
 
 /// Mean difference of each number from the one `step` later. Logarithms, so that no column dominates the others.
 fn unlikeness(numbers: &[f32], step: usize) -> f64 {
     let log = |number: f32| f64::from(number.abs().ln_1p().copysign(number));
-    let pairs = numbers.iter().zip(&numbers[step..]);
+    let pairs = numbers.iter().zip(numbers.get(step..).unwrap_or_default());
     let sum: f64 = pairs.map(|(&a, &b)| (log(a) - log(b)).abs()).filter(|difference| difference.is_finite()).sum();
     sum / (numbers.len() - step) as f64
 }

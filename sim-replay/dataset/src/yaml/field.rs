@@ -103,6 +103,7 @@ impl<'a> Field<'a> {
     }
 
     /// An integer, or a float without fraction: ids are written as `-1.0` where they went through an array of floats.
+    #[expect(clippy::cast_possible_truncation, reason = "an integer below 1e15")]
     pub(crate) fn integer(&self) -> Result<i64, ReadError> {
         if let Value::Integer(value) = self.node.value {
             return Ok(value);

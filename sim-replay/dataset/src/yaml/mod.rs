@@ -49,7 +49,7 @@ pub(super) fn read(path: &Path) -> Result<Node, ReadError> {
 pub(super) fn parse(path: &Path, bytes: &[u8]) -> Result<Node, ReadError> {
     let malformed = |line, reason: String| ReadError::Malformed { path: path.to_owned(), line, field: None, reason };
     let text = std::str::from_utf8(bytes).map_err(|error| {
-        let line = bytes[..error.valid_up_to()].iter().filter(|&&byte| byte == b'\n').count() as u64 + 1;
+        let line = bytes.iter().take(error.valid_up_to()).filter(|&&byte| byte == b'\n').count() as u64 + 1;
         malformed(Some(line), "the text is not UTF-8".into())
     })?;
     tree::build(text).map_err(|unsound| malformed(Some(unsound.line), format!("no sound YAML: {}", unsound.reason)))

@@ -81,7 +81,7 @@ fn note_overlaps(element: Element, width: &Profile, length_m: f64, log: &mut Fin
 /// A profile over places counted from `start_m` on.
 fn shifted(profile: &Profile, start_m: f64) -> Profile {
     let last_before = profile.records.partition_point(|&(start, _)| start <= start_m).saturating_sub(1);
-    let records = profile.records[last_before.min(profile.records.len())..].iter();
+    let records = profile.records.get(last_before..).unwrap_or_default().iter();
     let records = records.map(|&(start, coefficients)| {
         if start < start_m { (0.0, moved(coefficients, start_m - start)) } else { (start - start_m, coefficients) }
     });
@@ -105,7 +105,8 @@ fn sum(a: &Profile, b: &Profile) -> Profile {
     };
     let records = starts.into_iter().map(|place| {
         let (a, b) = (at(a, place), at(b, place));
-        (place, std::array::from_fn(|power| a[power] + b[power]))
+        let ([a0, a1, a2, a3], [b0, b1, b2, b3]) = (a, b);
+        (place, [a0 + b0, a1 + b1, a2 + b2, a3 + b3])
     });
     Profile { records: records.collect() }
 }

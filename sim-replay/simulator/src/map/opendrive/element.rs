@@ -85,8 +85,10 @@ impl<'input> LineIndex<'input> {
     pub(super) fn new(text: &'input str) -> Self {
         let text = text.as_bytes();
         let mut breaks = vec![0];
+        let mut before = 0;
         for block in text.chunks(BLOCK) {
-            breaks.push(breaks[breaks.len() - 1] + line_breaks(block));
+            before += line_breaks(block);
+            breaks.push(before);
         }
         Self { text, breaks }
     }
@@ -94,7 +96,8 @@ impl<'input> LineIndex<'input> {
     fn line(&self, place: usize) -> u32 {
         let place = place.min(self.text.len());
         let block = place / BLOCK;
-        self.breaks[block] + line_breaks(&self.text[block * BLOCK..place]) + 1
+        let before = self.breaks.get(block).copied().unwrap_or_default();
+        before + line_breaks(self.text.get(block * BLOCK..place).unwrap_or_default()) + 1
     }
 }
 

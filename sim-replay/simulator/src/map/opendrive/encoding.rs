@@ -16,7 +16,7 @@ pub(super) fn decode<'a>(bytes: &'a [u8], log: &mut FindingLog) -> Cow<'a, str> 
         Some(found) => found,
         None => (unmarked(bytes, log), 0),
     };
-    let bytes = &bytes[mark..];
+    let bytes = bytes.get(mark..).unwrap_or_default();
     if let Some(text) = encoding.decode_without_bom_handling_and_without_replacement(bytes) {
         return text;
     }
@@ -36,7 +36,7 @@ fn unmarked(bytes: &[u8], log: &mut FindingLog) -> &'static Encoding {
         [0, b'<', ..] => return UTF_16BE,
         _ => {}
     }
-    let Some(label) = declared(&bytes[..bytes.len().min(DECLARATION_BYTES)]) else { return UTF_8 };
+    let Some(label) = declared(bytes.get(..DECLARATION_BYTES).unwrap_or(bytes)) else { return UTF_8 };
     match Encoding::for_label(label.as_bytes()) {
         // A declaration that can be read byte by byte is no UTF-16, whatever it declares.
         Some(encoding) if encoding == UTF_16LE || encoding == UTF_16BE => UTF_8,

@@ -85,8 +85,9 @@ fn read_side(
     }
     elements.sort_by_key(|&(id, _)| id);
     let count = elements.iter().zip(1..).take_while(|((id, _), place)| id == place).count();
-    for &(_, element) in &elements[count..] {
-        let expected = format!("{}, without gaps or doubles", sign * (count as i32 + 1));
+    let next = elements.iter().zip(1..).find(|((id, _), place)| id != place).map_or(1, |(_, place)| place);
+    for &(_, element) in elements.iter().skip(count) {
+        let expected = format!("{}, without gaps or doubles", sign * next);
         let id = element.optional_text("id").unwrap_or_default();
         element.error_value("id", id, &expected).note(log, "lane left out");
     }

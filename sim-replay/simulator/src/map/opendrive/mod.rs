@@ -6,6 +6,9 @@
 //! out, as small a part as possible, and listed in [`RoadNetwork::findings`]. Every value from the file is bounded
 //! before it is used, so that no file can cause a panic, a hang or unbounded memory.
 
+// Maps come from other programs: an index or a cast that does not fit is an error of the map, not a panic.
+#![cfg_attr(not(test), deny(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::indexing_slicing))]
+
 mod beside;
 mod border;
 mod element;
@@ -88,9 +91,9 @@ fn read_text(text: &str, mut log: FindingLog) -> Result<RoadNetwork, OpenDriveEr
     for (road, element) in roads.iter_mut().zip(elements) {
         log.enter("road", &road.id);
         links::read(element, road, &ids, &mut log);
-        if let Some(junction) = road.junction {
-            junctions_m[junction] += lanes_length_m(road);
-            check_total(element, "the lanes of its junction", junctions_m[junction], MAX_JUNCTION_M)?;
+        if let Some(total_m) = road.junction.and_then(|junction| junctions_m.get_mut(junction)) {
+            *total_m += lanes_length_m(road);
+            check_total(element, "the lanes of its junction", *total_m, MAX_JUNCTION_M)?;
         }
     }
     let mut junctions = Vec::new();

@@ -14,7 +14,7 @@ use dataset::frame::{Frame, Object, ObjectClass};
 
 /// Layouts for which there is a reader.
 const LAYOUTS: [(SceneLayout, Layout); 2] =
-    [(SceneLayout::V2v4real, Layout::V2v4Real), (SceneLayout::V2xreal, Layout::V2xReal)];
+    [(SceneLayout::V2v4real, Layout::V2V4REAL), (SceneLayout::V2xreal, Layout::V2XREAL)];
 
 #[test]
 fn a_scene_is_the_same_in_every_layout_that_is_read() {
@@ -41,7 +41,7 @@ fn a_converted_data_set_is_the_same_as_a_generated_one() {
     assert_same(&ticks(&open(second.path())), &expected, SceneLayout::V2v4real);
     convert(&open(second.path()), &into(SceneLayout::Opv2v, third.path()), &|_, _| {}).unwrap();
     let back = open(third.path());
-    assert_eq!(back.layout, Layout::Opv2v);
+    assert_eq!(back.layout, Layout::OPV2V);
     assert_same(&ticks(&back), &expected, SceneLayout::Opv2v);
     let names = |path| open(path).scenarios.iter().map(|scenario| scenario.name.clone()).collect::<Vec<_>>();
     assert_eq!(names(first.path()), names(third.path()));

@@ -33,7 +33,7 @@ fn sequences(layout: SceneLayout, found: Layout) -> (Vec<Vec<Tick>>, Vec<u64>) {
 
 #[test]
 fn oxford_keeps_poses_and_points() {
-    let (sequences, others) = sequences(SceneLayout::Oxford, Layout::Oxford);
+    let (sequences, others) = sequences(SceneLayout::Oxford, Layout::OXFORD);
     assert!(others.is_empty());
     for (sequence, expected) in sequences.iter().zip(by_agent(&expected())) {
         for (tick, expected) in sequence.iter().zip(&expected) {
@@ -45,7 +45,7 @@ fn oxford_keeps_poses_and_points() {
 
 #[test]
 fn nclt_keeps_poses_and_points_to_its_resolution() {
-    let (sequences, others) = sequences(SceneLayout::Nclt, Layout::Nclt);
+    let (sequences, others) = sequences(SceneLayout::Nclt, Layout::NCLT);
     let expected = by_agent(&expected());
     // 5 mm, 1 of 255 steps, and nothing beyond 100 m behind, to the left and above.
     let has_step = |metres: f32| ((f64::from(metres) + 100.0) / 0.005).round() >= 0.0;
@@ -66,7 +66,7 @@ fn nclt_keeps_poses_and_points_to_its_resolution() {
 
 #[test]
 fn kitti_odometry_keeps_motions_and_points() {
-    let (sequences, others) = sequences(SceneLayout::KittiOdometry, Layout::KittiOdometry);
+    let (sequences, others) = sequences(SceneLayout::KittiOdometry, Layout::KITTI_ODOMETRY);
     assert!(others.is_empty());
     for (sequence, expected) in sequences.iter().zip(by_agent(&expected())) {
         let first = expected[0].poses[0];
