@@ -35,7 +35,7 @@ impl ChannelMixing {
     }
 
     /// Converts feature maps `[N, C, H, W]` to the axes of the ego; those at the identity pose, the ego's own, are
-    /// unchanged. The result has the memory order `order`, where no gradient flows.
+    /// unchanged. Where no gradient flows, the result has the given memory order.
     ///
     /// # Errors
     /// [`TchError`] when the channels differ from its own, or there is not one pose per feature map.
@@ -53,9 +53,10 @@ impl ChannelMixing {
         }
         let result = with_order(features, order)?;
         for (map, matrix) in (0..).zip(&matrices) {
-            let (from, to) = (flat(&features.f_get(map)?)?, flat(&result.f_get(map)?)?);
+            let (from, mut to) = (flat(&features.f_get(map)?)?, flat(&result.f_get(map)?)?);
             match matrix {
                 Some(matrix) => drop(matrix.f_mm_out(&to, &from)?.f_relu_()?),
+                None if to.stride() == from.stride() => to.f_copy_(&from)?,
                 // Exact, and faster than the library's copy into another memory order.
                 None => drop(self.identity()?.f_mm_out(&to, &from)?),
             }
