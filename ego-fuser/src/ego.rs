@@ -265,7 +265,7 @@ impl Ego {
                 age_secs: age_nanos as f64 * 1e-9,
             });
         }
-        let newest = ReceivedMaps::new(Tensor::f_cat(&maps, 0)?, Some(Tensor::f_cat(&sent, 0)?));
+        let newest = ReceivedMaps::new(one_after_another(&maps)?, Some(one_after_another(&sent)?));
         let earlier = (!earlier.is_empty()).then(|| ReceivedMaps::together(&earlier)).transpose()?;
         let on_grid = self.fusion.align_with(&newest, earlier, &metadata)?;
         stages.lap("align");
@@ -315,7 +315,7 @@ impl Ego {
         for ((Aligned { view, .. }, (map, sent)), index) in aligned.iter().zip(maps).zip(0..) {
             let Some(world_from_cav) = view.pose.world_from_cav().copied() else { continue };
             let confidence = f64::from(view.pose.confidence());
-            let turned = on_grid.received.maps.f_narrow(0, index, 1)?;
+            let turned = on_grid.received.only(index, index + 1)?;
             let map = self.fusion.kept(&ReceivedMaps::new(map, Some(sent)), &turned)?;
             let kept = KeptMap { capture_nanos: view.capture_nanos, world_from_cav, confidence, map };
             self.history.keep(&view.cav, kept);
@@ -366,6 +366,14 @@ impl Ego {
         let detections = postprocess(&[boxes], &self.limits).iter().map(|found| found.detection(None)).collect();
         stages.lap("boxes");
         Ok(detections)
+    }
+}
+
+/// Maps `[1, ..]` as `[N, ..]`; a single one is not copied.
+fn one_after_another(maps: &[Tensor]) -> Result<Tensor, TchError> {
+    match maps {
+        [map] => Ok(map.shallow_clone()),
+        maps => Tensor::f_cat(maps, 0),
     }
 }
 

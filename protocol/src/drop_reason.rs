@@ -42,6 +42,9 @@ named! {
         Paced = "paced",
         /// Exceeds the rate limit of its sender.
         RateLimit = "rate_limit",
+        /// Taken by the router and not handed on to this receiver, which took earlier messages too slowly or had lost
+        /// its connection.
+        Undelivered = "undelivered",
     }
 }
 

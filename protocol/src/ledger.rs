@@ -166,8 +166,13 @@ impl Ledger {
 
     /// Counts one message dropped.
     pub fn dropped(&mut self, account: &Account, reason: DropReason) {
+        self.dropped_many(account, reason, 1);
+    }
+
+    /// Counts messages dropped for one reason.
+    pub fn dropped_many(&mut self, account: &Account, reason: DropReason, messages: u64) {
         let count = self.counts(account).dropped.entry(reason).or_default();
-        *count = count.saturating_add(1);
+        *count = count.saturating_add(messages);
     }
 
     /// Counts one feature map that was written to keep within a limit.

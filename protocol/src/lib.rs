@@ -125,7 +125,8 @@ pub use limits::Limits;
 pub use message::{
     AgentTruth, Bev, Boxes, Control, Descriptor, Detections, DetectionsReport, EgoMotion, FusedNeighbour, Gnss,
     GnssSource, Kind, Lidar, Message, ModelHash, NeighbourState, NoPoseReason, Pace, Payload, PlanarCovariance, Points,
-    PoseEstimate, Radar, SkippedNeighbour, StageSummary, StageTiming, Stats, TopicCount, TrueObject, Truth,
+    PoseEstimate, ProcessUsage, Radar, SkippedNeighbour, StageSummary, StageTiming, Stats, TopicCount, TopicTraffic,
+    TrueObject, Truth,
 };
 pub use misbehaviour_reason::MisbehaviourReason;
 pub use point_cloud::{Handedness, PointCloud};

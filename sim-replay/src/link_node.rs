@@ -240,7 +240,7 @@ impl<'a> Node<'a> {
             let topic = Topic::Received { ego: self.options.ego.clone(), cav: cav.clone(), stream };
             let how = if stream == Stream::Pose { PublisherOptions::POSE } else { PublisherOptions::FEATURES };
             // The emulator decides the losses; forwarding is lossless.
-            publishers.insert(stream, self.bus.publisher(topic, how.lossless(PLACES))?);
+            publishers.insert(stream, self.bus.publisher(topic, how.waiting(PLACES))?);
         }
         let (ended, position_m, has_left) = (BTreeSet::new(), None, false);
         Ok(Vehicle { publishers, ended, position_m, has_left, _subscriptions: subscriptions })

@@ -44,6 +44,9 @@ pub struct RecordReport {
     pub seconds: f64,
     /// Messages lost because they arrived faster than they could be written.
     pub overwritten: u64,
+    /// Messages that the router did not hand on, as the recorder took earlier ones too slowly.
+    #[serde(default)]
+    pub undelivered: u64,
     /// Messages that arrived after writing had failed, or were in the chunk that failed.
     pub not_written: u64,
     /// Reason of the failure.
@@ -54,16 +57,19 @@ impl RecordReport {
     /// True if all received messages are in the file.
     #[must_use]
     pub fn is_complete(&self) -> bool {
-        self.overwritten == 0 && self.not_written == 0 && self.failure.is_none()
+        self.overwritten == 0 && self.undelivered == 0 && self.not_written == 0 && self.failure.is_none()
     }
 
     /// Description of the missing messages; `None` if there are none.
     #[must_use]
     pub fn loss_in_words(&self) -> Option<String> {
-        let Self { file, messages, seconds, overwritten, not_written, failure, .. } = self;
-        let missing = overwritten + not_written;
+        let Self { file, messages, seconds, overwritten, undelivered, not_written, failure, .. } = self;
+        let missing = overwritten + undelivered + not_written;
         match failure {
             None if missing == 0 => None,
+            None if *undelivered == missing => Some(format!(
+                "recording with gaps: the recorder was too slow for the router, {missing} messages missing"
+            )),
             None => Some(format!("recording with gaps: the disk is too slow, {missing} messages missing")),
             Some(why) if *messages == 0 => Some(format!("nothing is recorded: {why}, {missing} messages missing")),
             Some(why) => Some(format!(
@@ -123,6 +129,7 @@ pub fn record(
             bytes: 0,
             seconds: 0.0,
             overwritten: 0,
+            undelivered: 0,
             not_written: 0,
             failure,
         },
@@ -131,7 +138,7 @@ pub fn record(
         (recorder.on_failure)(&recorder.report);
     }
     recorder.listen(&tap, options.keeps_running);
-    let report = recorder.finish(tap.overwritten());
+    let report = recorder.finish(tap.overwritten(), tap.undelivered());
     presence.withdraw()?;
     Ok(report)
 }
@@ -206,10 +213,11 @@ impl Recorder<'_> {
         }
     }
 
-    fn finish(mut self, overwritten: u64) -> RecordReport {
+    fn finish(mut self, overwritten: u64, undelivered: u64) -> RecordReport {
         let has_file = self.writer.is_some() || self.report.messages > 0;
         self.attempt(RecordingWriter::finish);
         self.report.overwritten = overwritten;
+        self.report.undelivered = undelivered;
         self.report.not_written = self.taken - self.report.messages;
         if has_file && let Ok(file) = std::fs::metadata(&self.report.file) {
             self.report.bytes = file.len();

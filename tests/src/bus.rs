@@ -24,12 +24,21 @@ impl TestRouter {
     /// When there is no free port.
     #[must_use]
     pub fn open() -> Self {
+        Self::with(|options| options)
+    }
+
+    /// The same, with other options.
+    ///
+    /// # Panics
+    /// When there is no free port.
+    #[must_use]
+    pub fn with(change: impl Fn(BusOptions) -> BusOptions) -> Self {
         // Another process may take the port between the two calls.
         let opened = (0..20).find_map(|_| {
             let endpoint = Endpoint::loopback(free_port());
             // A pause of the whole machine must not count as a stalled receiver.
             let options = BusOptions { stall_limit: TIMEOUT, ..BusOptions::router(endpoint.clone()) };
-            bus::open(&options).ok().map(|session| (endpoint, session))
+            bus::open(&change(options)).ok().map(|session| (endpoint, session))
         });
         let (endpoint, session) = opened.expect("a free port on loopback");
         Self { endpoint, _session: session }

@@ -129,8 +129,17 @@ impl Up {
     /// When it cannot be started.
     #[must_use]
     pub fn start(folder: &Path, scenario: &Path) -> Self {
+        Self::by(Command::new(programs().join("v2vloc")), folder, scenario)
+    }
+
+    /// The same by a command that runs `v2vloc`, for example on another host.
+    ///
+    /// # Panics
+    /// When it cannot be started.
+    #[must_use]
+    pub fn by(mut v2vloc: Command, folder: &Path, scenario: &Path) -> Self {
         let runs = folder.join("runs");
-        let mut child = Command::new(programs().join("v2vloc"))
+        let mut child = v2vloc
             .arg("up")
             .arg(scenario)
             .arg("--runs")

@@ -46,6 +46,15 @@ impl Hosts {
         command
     }
 
+    /// Cuts the virtual link to the other host of this index: nothing crosses it, and neither end is told.
+    ///
+    /// # Errors
+    /// The error of `ip`.
+    pub fn cut(&self, index: usize) -> io::Result<()> {
+        let host = self.names.get(index + 1).map_or_else(String::new, |name| self.namespace(name));
+        ip(&format!("-n {host} link set {}h{index} down", self.prefix))
+    }
+
     fn namespace(&self, host: &str) -> String {
         format!("{}-{host}", self.prefix)
     }

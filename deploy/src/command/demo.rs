@@ -49,6 +49,9 @@ pub(crate) struct Arguments {
     /// Fusion methods, one run each.
     #[arg(long, value_delimiter = ',', default_values_t = [Method::NONE, Method::LATE, Method::MAX, Method::PASTAT])]
     methods: Vec<Method>,
+    /// Seconds of the scene per second: below 1 slower, for machines that do not keep up.
+    #[arg(long, value_name = "TIMES", default_value_t = 1.0)]
+    rate: f64,
     /// Print the metrics of the last method's run as JSON instead of a table of all.
     #[arg(long)]
     json: bool,
@@ -59,6 +62,7 @@ impl Arguments {
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
         let mut scenario = Scenario::read(&self.scenario)?;
         scenario.scene.dir = self.scene()?;
+        scenario.scene.rate = self.rate;
         let name = self.name.clone().unwrap_or_else(|| name_of_now("demo"));
         let mut results = Vec::new();
         for &method in &self.methods {
@@ -67,6 +71,9 @@ impl Arguments {
             scenario.check(&self.scenario)?;
             let options = RunOptions { runs: self.runs.clone(), programs: programs()?, prefix: "demo" };
             let result = run_scenario(&scenario, &options).with_context(|| format!("method {method}"))?;
+            if !self.json {
+                output::line(report::run_report(&result))?;
+            }
             let interrupted = result.interrupted;
             results.push(result);
             if interrupted {
@@ -74,6 +81,7 @@ impl Arguments {
             }
         }
         self.print(&results)?;
+        results.iter().for_each(|result| report::print_loss(result, results.len() > 1));
         Ok(Outcome::of(results.iter().any(RunResult::lost_data)))
     }
 

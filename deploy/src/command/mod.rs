@@ -3,6 +3,7 @@
 mod demo;
 mod eval;
 mod keys;
+mod report;
 mod router;
 mod schema;
 mod status;
@@ -41,6 +42,8 @@ pub(crate) enum Command {
     /// Print the JSON schema of a kind of file, for editors: the files in deploy/scenarios and deploy/experiments are
     /// its output.
     Schema(schema::Arguments),
+    /// Print stages, pace, latency, CPU, memory and bytes of a run that has ended.
+    Report(report::Arguments),
     /// Run a grid of experiments in simulation time: one CSV, charts, a report.
     Sweep(sweep::Arguments),
     /// Report the state of a run: every process present, ready and answering? Exit code 1 if not.
@@ -54,12 +57,14 @@ pub(crate) enum Command {
 impl Command {
     /// Runs the subcommand.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
-        malloc_settings::ensure(&malloc_settings::KEPT_MEMORY).context("this program again")?;
+        let settings = [malloc_settings::KEPT_MEMORY.as_slice(), &[malloc_settings::ROUTER_THREADS]].concat();
+        malloc_settings::ensure(&settings).context("this program again")?;
         match self {
             Self::Demo(arguments) => arguments.run(),
             Self::Eval(arguments) => arguments.run(),
             Self::Status(arguments) => arguments.run(),
             Self::Keys(arguments) => arguments.run(),
+            Self::Report(arguments) => arguments.run(),
             Self::Router(arguments) => arguments.run(),
             Self::Schema(arguments) => arguments.run(),
             Self::Sweep(arguments) => arguments.run(),

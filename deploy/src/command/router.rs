@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use bus::shutdown::Stop;
-use bus::{AccessControl, BusOptions, Credentials, Endpoint, ROUTER, RejectionLog, STOP_LIMIT, open};
+use bus::{AccessControl, BusOptions, Credentials, Endpoint, ROUTER, RejectionLog, STOP_LIMIT, SharedMemory, open};
 use protocol::{RunId, RunScope};
 use support::output;
 use zenoh::Wait;
@@ -28,9 +28,13 @@ pub(crate) struct Arguments {
     /// The only run that is admitted [default: any].
     #[arg(long)]
     run: Option<RunId>,
-    /// Longest time for handing one message to one receiver before its connection is closed, seconds.
+    /// Longest time for handing one map or sweep to one receiver on another host before its connection is closed,
+    /// seconds. Other receivers do not wait for it.
     #[arg(long, default_value_t = 5.0, value_parser = seconds)]
     stall_limit: f64,
+    /// Route the messages that processes of this machine have in shared memory there: sockets carry descriptors only.
+    #[arg(long)]
+    shared_memory: bool,
     /// Largest message, MiB.
     #[arg(long, default_value_t = 32)]
     max_message_mib: usize,
@@ -94,6 +98,9 @@ impl Arguments {
     fn options(&self) -> anyhow::Result<BusOptions> {
         let mut options = BusOptions::router(self.listen.clone());
         options.stall_limit = Duration::from_secs_f64(self.stall_limit);
+        if self.shared_memory {
+            options.shared_memory = SharedMemory::Attached;
+        }
         options.max_message_bytes = self.max_message_mib.max(1) << 20;
         let Some(folder) = &self.keys else { return Ok(options) };
         let credentials = Credentials::read(folder)?;

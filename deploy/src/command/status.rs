@@ -24,11 +24,7 @@ impl Arguments {
     /// Prints the state of the run.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
         let bad_input = |error: deploy::operate::status::StatusError| BadInput::of(error);
-        let folder = match self.run {
-            Some(run) if run.is_dir() => run,
-            Some(name) => self.runs.join(name),
-            None => RunStatus::newest(&self.runs).map_err(bad_input)?,
-        };
+        let folder = RunStatus::folder(self.run, &self.runs).map_err(bad_input)?;
         let status = RunStatus::read(&folder).map_err(bad_input)?;
         if self.json {
             output::line(serde_json::to_string_pretty(&status)?)?;

@@ -31,6 +31,9 @@ pub(crate) struct Arguments {
     /// Number of ticks to play in place of the scenario's.
     #[arg(long)]
     frames: Option<usize>,
+    /// Seconds of the scene per second in place of the scenario's: below 1 slower, for machines that do not keep up.
+    #[arg(long, value_name = "TIMES")]
+    rate: Option<f64>,
     /// Record all messages in recording.mcap in the run folder; the scenario may exclude some.
     #[arg(long)]
     record: bool,
@@ -53,6 +56,7 @@ impl Arguments {
         scenario.run = self.name.or(scenario.run);
         scenario.method = self.method.unwrap_or(scenario.method);
         scenario.scene.frames = self.frames.or(scenario.scene.frames);
+        scenario.scene.rate = self.rate.unwrap_or(scenario.scene.rate);
         if self.record {
             scenario.record.get_or_insert_default();
         }
@@ -64,6 +68,7 @@ impl Arguments {
         } else {
             output::text(report::run_table(&result))?;
         }
+        report::print_loss(&result, false);
         Ok(Outcome::of(result.lost_data()))
     }
 }

@@ -4,16 +4,32 @@ use std::fmt::Write as _;
 
 use fusion::Exchange;
 use fusion::Method;
+use support::output;
 use support::text_table::{Side, TextTable};
 
 use crate::operate::progress::bytes;
+use crate::run::loss;
 use crate::run::run_fleet::RunResult;
-use crate::score::metrics::{Answered, ByIou, Contribution, Metrics, Percentiles};
+use crate::score::metrics::{ByIou, Contribution, Metrics, Percentiles};
 
-/// Table of a run: detections, latency, bytes.
+/// Table and report of a run: detections, latency, bytes, then pace, stages and resources.
 #[must_use]
 pub fn run_table(result: &RunResult) -> String {
-    table(std::slice::from_ref(&result.metrics)) + &run_notes(result)
+    table(std::slice::from_ref(&result.metrics)) + &run_report(result) + &run_notes(result)
+}
+
+/// Pace, stages, CPU, memory and bytes of a run, under its method.
+#[must_use]
+pub fn run_report(result: &RunResult) -> String {
+    format!("\n{} in {}\n{}", result.metrics.method, result.folder.path().display(), result.report)
+}
+
+/// Prints the reasons for exit code 3 to standard error, `with_method` under the method of the run.
+pub fn print_loss(result: &RunResult, with_method: bool) {
+    if let Some(sentence) = loss::sentence(result) {
+        let method = if with_method { format!("{}: ", result.metrics.method) } else { String::new() };
+        output::note(format_args!("exit 3: {method}{sentence}"));
+    }
 }
 
 /// Lines about one run below its row of the table.
@@ -65,18 +81,17 @@ pub fn table(all: &[Metrics]) -> String {
         Column::left("method", all, |metrics| metrics.method.clone()),
         Column::left("poses", all, |metrics| metrics.pose_source.clone()),
     ];
-    let is_live = all.iter().any(|metrics| metrics.answered.is_some());
+    let is_live = all.iter().any(|metrics| metrics.ap_streaming.is_some());
     columns.push(Column::right(if is_live { "answered" } else { "frames" }, all, frames));
     for (name, of) in BY_IOU {
         columns.push(Column::right(&format!("AP@{name}"), all, |metrics| number(of(&metrics.ap_global), 3)));
     }
     columns.push(Column::right("frame order 0.5", all, |metrics| number(metrics.ap_frame_order.at_50, 3)));
     if is_live {
-        let of = |ap: fn(&Answered) -> ByIou| {
-            move |metrics: &Metrics| number(metrics.answered.as_ref().and_then(|answered| ap(answered).at_50), 3)
-        };
-        columns.push(Column::right("all ticks 0.5", all, of(|answered| answered.ap_all_ticks)));
-        columns.push(Column::right("streaming 0.5", all, of(|answered| answered.streaming_ap)));
+        let all_ticks = |metrics: &Metrics| number(metrics.ap_unanswered_empty.at_50, 3);
+        let streaming = |metrics: &Metrics| number(metrics.ap_streaming.and_then(|ap| ap.at_50), 3);
+        columns.push(Column::right("all ticks 0.5", all, all_ticks));
+        columns.push(Column::right("streaming 0.5", all, streaming));
     }
     if all.iter().any(|metrics| metrics.contribution.sent > 0) {
         let fused = |metrics: &Metrics| number(metrics.contribution.fused_per_frame, 2);
@@ -96,7 +111,7 @@ const BY_IOU: [AtOverlap; 3] = [("0.3", |ap| ap.at_30), ("0.5", |ap| ap.at_50), 
 fn comparison(all: &[Metrics]) -> String {
     let mut text = String::new();
     if all.windows(2).any(|pair| pair[0].frames != pair[1].frames) {
-        let compare = match all.iter().any(|metrics| metrics.answered.is_some()) {
+        let compare = match all.iter().any(|metrics| metrics.ap_streaming.is_some()) {
             true => {
                 "compare \"all ticks\" and \"streaming\", in which unanswered ticks count, and not AP over other frames"
             }
@@ -124,8 +139,8 @@ fn shared(method: &str) -> Option<&'static str> {
 }
 
 fn frames(metrics: &Metrics) -> String {
-    match &metrics.answered {
-        Some(Answered { answered, ticks, .. }) => format!("{answered}/{ticks}"),
+    match metrics.ap_streaming {
+        Some(_) => format!("{}/{}", metrics.answered, metrics.ticks),
         None => metrics.frames.to_string(),
     }
 }
@@ -173,39 +188,27 @@ fn number(value: Option<f64>, digits: usize) -> String {
 
 #[cfg(test)]
 mod tests {
-    use std::collections::BTreeMap;
-
     use super::*;
-    use dataset::LeftOut;
-
-    use crate::score::metrics::{Communication, Latencies, Messages, PoseErrors};
+    use crate::score::metrics::Latencies;
+    use crate::score::metrics::tests::metrics as sample;
 
     fn metrics(method: &str, at_50: Option<f64>) -> Metrics {
         Metrics {
-            frames: 60,
-            seconds: 6.0,
-            clock: "wall".into(),
-            method: method.into(),
-            pose_source: "recorded".into(),
             ap_global: ByIou { at_50, ..ByIou::default() },
-            ap_frame_order: ByIou::default(),
-            answered: None,
-            pose: PoseErrors::default(),
             latency_ms: Latencies { capture_to_detection: Percentiles { p50: Some(81.4), ..Percentiles::default() } },
-            age_ms: Percentiles::default(),
-            neighbours: BTreeMap::new(),
-            comm: Communication::default(),
-            contribution: Contribution::default(),
-            messages: Messages::default(),
-            protocol: None,
-            left_out: LeftOut::default(),
+            ..sample(method)
         }
     }
 
     fn answered(method: &str, answered: u64, ap: f64) -> Metrics {
         let ap = |share: f64| ByIou { at_50: Some(ap * share), ..ByIou::default() };
-        let answered = Answered { answered, ticks: 60, ap_all_ticks: ap(0.5), streaming_ap: ap(0.25) };
-        Metrics { frames: answered.answered, answered: Some(answered), ..metrics(method, ap(1.0).at_50) }
+        Metrics {
+            frames: answered,
+            answered,
+            ap_unanswered_empty: ap(0.5),
+            ap_streaming: Some(ap(0.25)),
+            ..metrics(method, ap(1.0).at_50)
+        }
     }
 
     #[test]

@@ -70,6 +70,7 @@ mod tests {
             bytes: 1000,
             seconds: 0.93,
             overwritten: 0,
+            undelivered: 0,
             not_written,
             failure: failure.map(str::to_owned),
         };

@@ -4,7 +4,7 @@ use std::net::{SocketAddr, TcpListener, UdpSocket};
 use std::time::Duration;
 
 use bus::shutdown::{self, Overdue};
-use bus::{BusError, BusOptions, Endpoint, open, present, process_id};
+use bus::{BusError, BusOptions, Endpoint, SharedMemory, open, present, process_id};
 use zenoh::{Session, Wait};
 
 use protocol::{Principal, ProcessId, Role, RunId};
@@ -44,6 +44,9 @@ impl RouterEndpoint {
             None => {
                 let mut options = BusOptions::router(with_port(&network.listen, keys.is_some())?);
                 options.stall_limit = Duration::from_secs_f64(network.stall_limit_s);
+                if network.shared_memory_mib > 0 {
+                    options.shared_memory = SharedMemory::Attached;
+                }
                 keys.map_or(Ok(options.clone()), |keys| keys.for_router(options, run))
             }
         }?;

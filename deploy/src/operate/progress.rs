@@ -39,7 +39,7 @@ impl Display {
             None if self.last_line.elapsed() >= LINE_PERIOD && progress.frames != self.shown_frames => {
                 self.last_line = Instant::now();
                 self.shown_frames = progress.frames;
-                output::note(format_args!("{} frames  {}", progress.frames, summary(progress)));
+                output::note(format_args!("answered {}/{}  {}", progress.frames, progress.ticks, summary(progress)));
             }
             None => {}
         }

@@ -9,7 +9,7 @@ use protocol::RunId;
 use serde::Serialize;
 use support::csv_file::CsvText;
 
-use crate::score::{FrameRecord, StageStamps};
+use crate::score::{FrameRecord, StageStamps, StreamedResult};
 
 /// Reason why a run folder cannot be used.
 #[derive(Debug, thiserror::Error)]
@@ -132,11 +132,12 @@ impl RunFolder {
     }
 }
 
-/// The table of a run's frames: a header line, then a line per frame.
+/// The table of a run's ticks: a header line, then a line per tick, answered or not.
 fn frames_csv(records: &[FrameRecord], swept: &BTreeMap<u64, u64>) -> String {
     let mut text = CsvText::new(
         "tick,agent_frame,capture_nanos,latency_ms,detected,truth,found,fused,skipped,oldest_ms,stale,payload_bytes,wire_bytes,ego_error_m,\
-         ego_error_deg,swept_ms,posed_ms,published_ms,arrived_ms,decided_ms,fused_ms,detected_ms",
+         ego_error_deg,swept_ms,posed_ms,published_ms,arrived_ms,decided_ms,fused_ms,detected_ms,answered,tick_unix_nanos,\
+         streamed_tick,streamed_age_ms,streamed_detected,streamed_found",
     );
     records.iter().for_each(|record| text.row(frame_fields(record, swept)));
     text.finish()
@@ -161,16 +162,26 @@ fn frame_fields(record: &FrameRecord, swept: &BTreeMap<u64, u64>) -> Vec<String>
         wire_bytes,
         ego_error_m,
         ego_error_deg,
+        streamed,
     } = record;
-    let StageStamps { began_nanos: _, posed_ms, published_ms, arrived_ms, decided_ms, fused_ms, detected_ms } = stamps;
+    let StageStamps { began_nanos, posed_ms, published_ms, arrived_ms, decided_ms, fused_ms, detected_ms } = stamps;
     let swept_ms = swept.get(capture_nanos).and_then(|swept| stamps.since_began_ms(*swept));
     let number = |number: &Option<f64>| number.map_or(String::new(), |number| format!("{number:.4}"));
-    let mut fields = vec![tick.to_string(), agent_frame.to_string(), capture_nanos.to_string(), number(latency_ms)];
+    let optional = |number: Option<u64>| number.map_or(String::new(), |number| number.to_string());
+    let mut fields = vec![tick.to_string(), optional(*agent_frame), capture_nanos.to_string(), number(latency_ms)];
     fields.extend([detected, truth, found, fused, skipped].map(ToString::to_string));
     fields.extend([number(oldest_ms), stale.to_string(), payload_bytes.to_string(), wire_bytes.to_string()]);
     fields.extend([ego_error_m, ego_error_deg].map(number));
     fields.extend([&swept_ms, posed_ms, published_ms, arrived_ms, decided_ms, fused_ms, detected_ms].map(number));
+    fields.extend([u8::from(record.is_answered()).to_string(), optional(*began_nanos)]);
+    fields.extend(streamed_fields(streamed.as_ref()));
     fields
+}
+
+fn streamed_fields(streamed: Option<&StreamedResult>) -> [String; 4] {
+    streamed.map_or_else(Default::default, |StreamedResult { tick, age_ms, detected, found }| {
+        [tick.to_string(), format!("{age_ms:.4}"), detected.to_string(), found.to_string()]
+    })
 }
 
 /// Name for an unnamed run: `prefix` and the time, UTC, for example `up-20260131-235959`.
@@ -221,7 +232,7 @@ mod tests {
     fn every_line_of_the_table_has_every_column() {
         let record = FrameRecord {
             tick: 3,
-            agent_frame: 2,
+            agent_frame: Some(2),
             capture_nanos: 300_000_000,
             latency_ms: Some(81.25),
             stamps: StageStamps {
@@ -241,14 +252,18 @@ mod tests {
             wire_bytes: 1300,
             ego_error_m: Some(0.25),
             ego_error_deg: None,
+            streamed: Some(StreamedResult { tick: 1, age_ms: 200.5, detected: 15, found: 12 }),
         };
-        let text = frames_csv(&[record], &BTreeMap::from([(300_000_000, 1_002_500_000)]));
+        let unanswered = FrameRecord { agent_frame: None, latency_ms: None, streamed: None, ..record.clone() };
+        let text = frames_csv(&[record, unanswered], &BTreeMap::from([(300_000_000, 1_002_500_000)]));
         let lines: Vec<&str> = text.lines().collect();
         assert_eq!(
             lines[1],
-            "3,2,300000000,81.2500,20,22,18,1,0,100.0000,1,1000,1300,0.2500,,2.5000,40.5000,,,,,81.2500"
+            "3,2,300000000,81.2500,20,22,18,1,0,100.0000,1,1000,1300,0.2500,,2.5000,40.5000,,,,,81.2500,1,\
+             1000000000,1,200.5000,15,12"
         );
-        assert_eq!(lines[0].matches(',').count(), lines[1].matches(',').count());
+        assert!(lines[2].starts_with("3,,300000000,,") && lines[2].ends_with(",0,1000000000,,,,"), "{text}");
+        assert!(lines[1..].iter().all(|line| line.matches(',').count() == lines[0].matches(',').count()), "{text}");
     }
 
     #[test]

@@ -34,8 +34,14 @@ pub struct RunStatus {
     pub written_unix_ms: u64,
     /// Time since its start, seconds.
     pub seconds: f64,
-    /// Number of results of the ego so far.
+    /// Number of results of the ego so far: the answered ticks.
     pub frames: u64,
+    /// Number of ticks that the replay has published so far.
+    #[serde(default)]
+    pub ticks: u64,
+    /// Results per second so far.
+    #[serde(default)]
+    pub rate_hz: Option<f64>,
     /// Time since the last result, seconds.
     pub last_result_s: Option<f64>,
     /// Time from a tick to its result, milliseconds, of the last result.
@@ -103,6 +109,18 @@ impl RunStatus {
         Ok(if is_lost { Self { phase: Phase::Lost, ..status } } else { status })
     }
 
+    /// Folder of a run that is named by its path or by its name in `runs`; not named: the newest.
+    ///
+    /// # Errors
+    /// [`StatusError::NoRun`] when none is named and there is none.
+    pub fn folder(named: Option<PathBuf>, runs: &Path) -> Result<PathBuf, StatusError> {
+        match named {
+            Some(run) if run.is_dir() => Ok(run),
+            Some(name) => Ok(runs.join(name)),
+            None => Self::newest(runs),
+        }
+    }
+
     /// Folder of the run in `runs` with the newest status.
     ///
     /// # Errors
@@ -147,12 +165,14 @@ impl RunStatus {
     #[must_use]
     pub fn table(&self) -> String {
         let mut text = format!(
-            "{} {} for {:.0} s at {}: {} frames, latency {} ms, {} fused, {} dropped\n",
+            "{} {} for {:.0} s at {}: answered {}/{}, {} Hz, latency {} ms, {} fused, {} dropped\n",
             self.run,
             name_of(&self.phase),
             self.seconds,
             self.endpoint,
             self.frames,
+            self.ticks,
+            optional(self.rate_hz, 1),
             optional(self.latency_ms, 0),
             self.fused,
             self.dropped
@@ -256,6 +276,8 @@ impl StatusWriter {
             written_unix_ms: unix_ms(),
             seconds: now.duration_since(self.began).as_secs_f64(),
             frames: progress.frames,
+            ticks: progress.ticks,
+            rate_hz: progress.rate_hz(),
             last_result_s: progress.span.map(|(_, last)| now.saturating_duration_since(last).as_secs_f64()),
             latency_ms: progress.latency_ms,
             fused: progress.fused,
@@ -313,7 +335,7 @@ mod tests {
             misbehaviour: Some(protocol::MisbehaviourReason::GhostObjects),
             clock_offset_s: Some(0.0125),
         };
-        let progress = Progress { frames: 7, neighbours: vec![attacker], ..Progress::default() };
+        let progress = Progress { frames: 7, ticks: 9, neighbours: vec![attacker], ..Progress::default() };
         writer.write(Phase::Running, &progress, |_| vec![process(State::Ready)]);
         // Not due yet.
         writer.write(Phase::Running, &Progress::default(), |_| Vec::new());
@@ -321,7 +343,7 @@ mod tests {
         assert_eq!((status.phase, status.frames, status.processes.len()), (Phase::Running, 7, 1));
         assert!(status.is_well());
         let table = status.table();
-        assert!(table.starts_with("test running for 0 s at tcp/127.0.0.1:7447: 7 frames"), "{table}");
+        assert!(table.starts_with("test running for 0 s at tcp/127.0.0.1:7447: answered 7/9, - Hz"), "{table}");
         assert!(table.ends_with("4279           12.5   0.03  ghost_objects\n"), "{table}");
         assert!(table.contains("agent-4288") && table.contains("was ended by signal 9"), "{table}");
 

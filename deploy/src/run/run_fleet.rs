@@ -9,6 +9,7 @@ use std::time::{Duration, Instant};
 use bus::shutdown::Stop;
 use bus::{Endpoint, Rejection};
 use protocol::{Ledger, Reconciliation, RunId};
+use support::output;
 
 use crate::operate::RunError;
 use crate::operate::fleet::{Fleet, RECORDER, REPLAY, SessionContext};
@@ -19,7 +20,10 @@ use crate::operate::security::RefusalWatch;
 use crate::operate::status::Phase;
 use crate::operate::status_reporter::{Ending, StatusReporter};
 use crate::operate::supervise::{ProcessSpec, Supervisor};
+use crate::run::capacity::{Capacity, remedies};
 use crate::run::ledger_report::LedgerReport;
+use crate::run::loss;
+use crate::run::report::{self, RunReport};
 use crate::scenario::fingerprint::Provenance;
 use crate::scenario::{Clock, Scenario};
 use crate::score::metrics::Metrics;
@@ -35,6 +39,9 @@ const DRAIN_SHARE: f64 = 0.5;
 
 /// For writing the index of a recording, after all others have ended.
 const RECORDER_SHARE: Duration = Duration::from_millis(800);
+
+/// Files of results and of ground truth, a line each.
+const LINES: [&str; 2] = ["detections.jsonl", "truth.jsonl"];
 
 /// Settings of a run beside its scenario.
 #[derive(Debug, Clone)]
@@ -66,6 +73,12 @@ pub struct RunResult {
     pub unwritten: Vec<String>,
     /// Processes that failed in their task, with the reason.
     pub failures: Vec<String>,
+    /// Processes that crashed at least once.
+    pub crashed: Vec<String>,
+    /// Changes that would let the fleet answer more ticks; `None` in simulation time, where it answers all.
+    pub remedies: Option<String>,
+    /// Pace, stages and resources.
+    pub report: RunReport,
     /// Picture of one fused frame, if one could be drawn.
     pub picture: Option<PathBuf>,
 }
@@ -74,14 +87,7 @@ impl RunResult {
     /// True if data were lost beyond the drops of the link.
     #[must_use]
     pub fn lost_data(&self) -> bool {
-        let dropped = self.metrics.messages.dropped.iter().any(|(reason, count)| reason.is_loss() && *count > 0);
-        dropped
-            || self.missed > 0
-            || !self.balance.is_exact()
-            || !self.unwritten.is_empty()
-            || !self.failures.is_empty()
-            || !self.killed.is_empty()
-            || self.metrics.messages.are_stuck()
+        loss::sentence(self).is_some()
     }
 }
 
@@ -103,10 +109,25 @@ pub fn run_scenario(scenario: &Scenario, options: &RunOptions) -> Result<RunResu
     result
 }
 
+/// Prints what this machine can carry. A run whose pace cannot be estimated goes on without.
+fn announce_capacity(fleet: &Fleet) -> Option<Capacity> {
+    let capacity = Capacity::estimate(fleet).unwrap_or_else(|error| {
+        tracing::warn!("the pace of the run cannot be estimated: {error}");
+        None
+    })?;
+    output::note(format_args!("this machine: {capacity}"));
+    if !capacity.keeps_up() {
+        output::note(format_args!("it will not keep up; {} would help", remedies(fleet, Some(&capacity))));
+    }
+    Some(capacity)
+}
+
 /// Runs a fleet under the given run name in the given folder.
 fn go(fleet: &Fleet, options: &RunOptions, run: &RunId, folder: &RunFolder) -> Result<RunResult, RunError> {
     let stop = Stop::new();
     stop.on_signals().map_err(RunError::Signals)?;
+    // Before anything else of the run takes the cores.
+    let capacity = announce_capacity(fleet);
     let fingerprint = fingerprint(fleet, &options.programs);
 
     let keys = fleet.keys(folder)?;
@@ -117,8 +138,8 @@ fn go(fleet: &Fleet, options: &RunOptions, run: &RunId, folder: &RunFolder) -> R
     place.check_free(&fleet.scenario.network, run, &specs)?;
     let refused = RefusalWatch::over(&place)?;
     let board = FrameScores::new(fleet.ego.clone(), fleet.ground_truth_rule(), fleet.map_values());
-    let detections = folder.file("detections.jsonl");
-    let mut scorer = ScorerNode::start(place.session.clone(), run, &fleet.agents, &fleet.ego, board, detections)?;
+    let files = LINES.map(|name| folder.file(name));
+    let mut scorer = ScorerNode::start(place.session.clone(), run, &fleet.agents, &fleet.ego, board, files)?;
     if let Some(address) = fleet.scenario.network.metrics {
         scorer.serve_metrics(address)?;
     }
@@ -131,7 +152,7 @@ fn go(fleet: &Fleet, options: &RunOptions, run: &RunId, folder: &RunFolder) -> R
     }
     let watched = watched?;
 
-    let result = write(fleet, run, folder.clone(), (scored, &refused), &watched, fingerprint);
+    let result = write(fleet, (run, folder.clone()), (scored, &refused), &watched, fingerprint, capacity);
     match watched.ending {
         Ending::Over | Ending::Asked => Ok(result),
         Ending::Failed { process, how } => {
@@ -150,6 +171,8 @@ struct Watched {
     offline: BTreeSet<String>,
     /// Processes that failed in their task, with the reason.
     failures: Vec<String>,
+    /// Processes that crashed at least once.
+    crashed: Vec<String>,
 }
 
 /// Arrival time of each sweep at the ego's agent, by capture time. An agent on another host writes none.
@@ -189,7 +212,8 @@ fn watch(
     let mut watch = StatusReporter::new(fleet, run, endpoint, folder);
     let ending = watch.follow(&supervisor, &happened, scorer, stop, &mut display);
     let mut offline = scorer.absent();
-    offline.extend(watch.fallen());
+    let crashed = watch.fallen();
+    offline.extend(crashed.iter().cloned());
     watch.tell(Phase::Ending, &scorer.progress());
     let limits = Limits::of(fleet, &ending);
     let mut killed = supervisor.end(|name| name == REPLAY, limits.replay).killed;
@@ -205,7 +229,7 @@ fn watch(
     watch.tell(Phase::Over, &scorer.progress());
     offline.extend(killed.iter().cloned());
     let failures = watch.failures();
-    Ok(Watched { ending, killed, offline, failures })
+    Ok(Watched { ending, killed, offline, failures, crashed })
 }
 
 /// Deadlines of the steps of the end.
@@ -259,16 +283,16 @@ fn fingerprint(fleet: &Fleet, programs: &Path) -> JoinHandle<std::io::Result<Pro
 /// Writes the run folder; files that cannot be written are listed in the result, which is not lost with them.
 fn write(
     fleet: &Fleet,
-    run: &RunId,
-    folder: RunFolder,
+    (run, folder): (&RunId, RunFolder),
     (scored, refused): (Scored, &BTreeMap<Rejection, u64>),
     watched: &Watched,
     fingerprint: JoinHandle<std::io::Result<Provenance>>,
+    capacity: Option<Capacity>,
 ) -> RunResult {
     let Scored { board, stats, progress, unwritten: lines } = scored;
     let mut unwritten = Vec::new();
-    if lines > 0 {
-        unwritten.push(format!("{lines} results are missing in {}", folder.file("detections.jsonl").display()));
+    for (name, lines) in LINES.iter().zip(lines).filter(|(_, lines)| *lines > 0) {
+        unwritten.push(format!("{lines} lines are missing in {}", folder.file(name).display()));
     }
     let mut note = |written: Result<(), RunFolderError>| {
         if let Err(error) = written {
@@ -281,8 +305,13 @@ fn write(
     }
     let exempted = sum.exempt(|account| offline_intervals::concerns(&watched.offline, account));
     let balance = sum.balance();
+    let missed = missed(fleet, &board, &watched.ending);
     let metrics = metrics(fleet, &board, &progress, &sum);
+    let metrics = Metrics { ticks: metrics.answered + missed, ..metrics };
     note(folder.write_json("metrics.json", &metrics));
+    let remedies = remedies(fleet, capacity.as_ref());
+    let run_report = RunReport::new(run, &metrics, board.records(), &stats, capacity);
+    note(folder.write_json(report::FILE, &run_report));
     note(folder.write_frames(board.records(), &swept(&folder.file(SWEEP_LOG))));
     let report = LedgerReport::new(&stats, &sum, &balance, (&watched.offline, exempted)).with_refused(refused);
     note(folder.write_json("ledger.json", &report));
@@ -298,15 +327,26 @@ fn write(
     note(folder.write("scenario.yaml", &resolved.to_yaml()));
     let picture = crate::run::demo::draw(fleet, &board, &folder.file("frame.png"));
     let interrupted = matches!(watched.ending, Ending::Asked);
-    let (killed, failures) = (watched.killed.clone(), watched.failures.clone());
-    let missed = missed(fleet, &board, &watched.ending);
-    RunResult { folder, metrics, balance, missed, interrupted, killed, unwritten, failures, picture }
+    RunResult {
+        folder,
+        metrics,
+        balance,
+        missed,
+        interrupted,
+        killed: watched.killed.clone(),
+        unwritten,
+        failures: watched.failures.clone(),
+        crashed: watched.crashed.clone(),
+        remedies: Some(remedies),
+        report: run_report,
+        picture,
+    }
 }
 
 /// Ticks without a result. Those that no process reported, as the replay crashed with them in transit, are known by
 /// their number only, once the scene is over.
 fn missed(fleet: &Fleet, board: &FrameScores, ending: &Ending) -> u64 {
-    let reported = board.records().len() as u64 + board.missed();
+    let (reported, _) = board.ticks();
     let played = fleet.ticks.filter(|_| matches!(ending, Ending::Over)).unwrap_or(0) as u64;
     board.missed() + played.saturating_sub(reported)
 }

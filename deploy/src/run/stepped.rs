@@ -23,12 +23,13 @@ use crate::operate::agent_pool::CrewProcesses;
 use crate::operate::fleet::{Fleet, FleetError, open_options};
 use crate::operate::run_folder::{RunFolder, RunFolderError, name_of_now};
 use crate::run::ledger_report::LedgerReport;
+use crate::run::report::{self, RunReport};
 use crate::run::run_fleet::{RunOptions, RunResult};
 use crate::scenario::fingerprint::Provenance;
 use crate::scenario::{Scenario, Stepped};
-use crate::score::FrameScores;
 use crate::score::evaluated_frame::judge;
 use crate::score::metrics::Metrics;
+use crate::score::{FrameScores, TruthLine};
 
 /// Runs a scenario in simulation time to its end.
 ///
@@ -73,19 +74,19 @@ fn go(
     let board = play(fleet, recorded, evaluator, folder)?;
     evaluator.set_processes(None);
     let killed = processes.map(CrewProcesses::end).unwrap_or_default();
-    let result = write(fleet, evaluator, &board, folder.clone(), options)?;
+    let result = write(fleet, evaluator, &board, (run, folder.clone()), options)?;
     Ok(RunResult { killed, ..result })
 }
 
 /// Recorded scenario of the fleet.
-fn recorded(fleet: &Fleet) -> Result<Recorded, FleetError> {
+pub(super) fn recorded(fleet: &Fleet) -> Result<Recorded, FleetError> {
     let scene = &fleet.scenario.scene;
     let scenarios = dataset::open_with(&scene.dir, &open_options(scene))?.scenarios;
     let found = scenarios.into_iter().find(|known| Some(&known.name) == scene.scenario.as_ref());
     found.ok_or_else(|| FleetError::Empty(scene.dir.clone()))
 }
 
-fn evaluate_config(fleet: &Fleet) -> EvaluateConfig {
+pub(super) fn evaluate_config(fleet: &Fleet) -> EvaluateConfig {
     let scenario = &fleet.scenario;
     EvaluateConfig {
         weights: scenario.models.weights.clone(),
@@ -147,25 +148,40 @@ fn play(
     let path = folder.file("detections.jsonl");
     let unwritable = |source| RunFolderError::Write { path: path.clone(), source };
     let mut file = BufWriter::new(File::create(&path).map_err(unwritable)?);
+    let mut truth = BufWriter::new(File::create(folder.file("truth.jsonl")).map_err(unwritable)?);
     let bar = progress::bar(fleet.ticks.unwrap_or(0), "ticks");
     let mut written = Ok(());
     let _ = evaluator.run(recorded, &mut |frame: EvaluatedFrame| {
         bar.inc(1);
         let report = DetectionsReport::new(&frame.stamp, Some(frame.tick as u64), frame.result.clone());
-        written = writeln!(file, "{}", report.to_json());
+        let of_truth = truth_line(&fleet.ego, &frame).to_json();
+        written = writeln!(file, "{}", report.to_json()).and_then(|()| writeln!(truth, "{of_truth}"));
         judge(&mut board, frame, true);
         if written.is_ok() { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
     })?;
     bar.finish_and_clear();
-    written.and_then(|()| file.flush()).map_err(unwritable)?;
+    written.and_then(|()| file.flush()).and_then(|()| truth.flush()).map_err(unwritable)?;
     Ok(board)
+}
+
+/// Ground truth of a computed tick.
+fn truth_line(ego: &CavId, frame: &EvaluatedFrame) -> TruthLine {
+    let own = frame.frames.iter().find(|recorded| recorded.cav == *ego);
+    TruthLine {
+        tick: frame.tick as u64,
+        capture_nanos: frame.stamp.capture_nanos,
+        publish_nanos: frame.stamp.capture_nanos,
+        ego: ego.clone(),
+        world_from_ego: own.and_then(|recorded| recorded.world_from_lidar),
+        boxes: frame.objects.clone(),
+    }
 }
 
 fn write(
     fleet: &Fleet,
     evaluator: &Evaluator,
     board: &FrameScores,
-    folder: RunFolder,
+    (run, folder): (&RunId, RunFolder),
     options: &RunOptions,
 ) -> Result<RunResult, RunError> {
     let ledger = evaluator.ledger();
@@ -173,6 +189,8 @@ fn write(
     let names = [fleet.scenario.method.name(), fleet.pose_source()];
     let metrics = Metrics::of(board, "stepped", names, board.seconds(), ledger, Some(evaluator.sent_bytes()));
     folder.write_json("metrics.json", &metrics)?;
+    let report = RunReport::new(run, &metrics, board.records(), &[], None);
+    folder.write_json(report::FILE, &report)?;
     folder.write_frames(board.records(), &std::collections::BTreeMap::new())?;
     folder.write_json("ledger.json", &LedgerReport::new(&[], ledger, &balance, (&BTreeSet::new(), 0)))?;
     let models = &fleet.scenario.models;
@@ -182,8 +200,20 @@ fn write(
     let resolved = Scenario { provenance, ..fleet.scenario.clone() };
     folder.write("scenario.yaml", &resolved.to_yaml())?;
     let picture = crate::run::demo::draw(fleet, board, &folder.file("frame.png"));
-    let (killed, unwritten, failures) = (Vec::new(), Vec::new(), Vec::new());
-    Ok(RunResult { folder, metrics, balance, missed: 0, interrupted: false, killed, unwritten, failures, picture })
+    Ok(RunResult {
+        folder,
+        metrics,
+        balance,
+        missed: 0,
+        interrupted: false,
+        killed: Vec::new(),
+        unwritten: Vec::new(),
+        failures: Vec::new(),
+        crashed: Vec::new(),
+        remedies: None,
+        report,
+        picture,
+    })
 }
 
 impl From<EvaluateError> for RunError {

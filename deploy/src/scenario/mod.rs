@@ -153,11 +153,12 @@ pub struct Network {
     pub listen: String,
     /// Router that runs already (`zenohd`), for example `tcp/10.0.0.1:7447`; no router is started then.
     pub connect: Option<String>,
-    /// Shared memory for large messages between processes of one machine, MiB; 0: everything takes the socket.
+    /// Pool of shared memory of each process for its large messages to others of the same machine, MiB; 0: everything
+    /// takes the socket. A router elsewhere has to be attached (`v2vloc router --shared-memory`).
     pub shared_memory_mib: usize,
-    /// Longest time for handing one message to one receiver, seconds, after which the router inside this run closes
-    /// that connection. Meanwhile it delivers nothing else of the same sender: a receiver behind a slow link needs more
-    /// (8 MiB at 13 Mbit/s take 5 s), and all other receivers wait for it.
+    /// Longest time for handing one map or sweep to one receiver on another host, seconds, after which the router
+    /// inside this run closes that connection. A receiver behind a slow link needs more (8 MiB at 13 Mbit/s take 5 s).
+    /// Other receivers do not wait for it.
     pub stall_limit_s: f64,
     /// Address at which the scorer serves its counters to Prometheus; the other processes take the ports after it, in
     /// the order in which they are started. Not served when absent.

@@ -5,13 +5,13 @@ use serde::Serialize;
 
 use super::StageStamps;
 
-/// One line of `frames.csv`.
+/// One line of `frames.csv`: a tick of the scene, with or without a result of the ego.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct FrameRecord {
     /// Tick of the scene, counted from 0.
     pub tick: u64,
-    /// Frame of the ego's own agent, see [`Detections::agent_frame`].
-    pub agent_frame: u64,
+    /// Frame of the ego's own agent, see [`Detections::agent_frame`]; `None` if the tick is unanswered.
+    pub agent_frame: Option<u64>,
     /// Capture time on the scene's clock, nanoseconds.
     pub capture_nanos: u64,
     /// From the publication of the tick to that of its detections, milliseconds; `None` without a result.
@@ -41,6 +41,58 @@ pub struct FrameRecord {
     pub ego_error_m: Option<f64>,
     /// Angle of the ego's own pose to the truth, degrees.
     pub ego_error_deg: Option<f64>,
+    /// The result that was the newest at this tick; `None` if there was none, or without times of publication.
+    pub streamed: Option<StreamedResult>,
+}
+
+/// The last result that had been published by a tick, scored against the truth at that tick.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct StreamedResult {
+    /// Tick of the sweep that it was made from.
+    pub tick: u64,
+    /// Time from that tick to this one, milliseconds.
+    pub age_ms: f64,
+    /// Number of its boxes that are still in the area, moved by the ego's true motion.
+    pub detected: usize,
+    /// Number of these that overlap a true box by at least 0.5.
+    pub found: usize,
+}
+
+impl FrameRecord {
+    /// True if the ego has published a result of the tick.
+    #[must_use]
+    pub fn is_answered(&self) -> bool {
+        self.agent_frame.is_some()
+    }
+
+    /// A tick without a result.
+    pub(super) fn unanswered(
+        tick: u64,
+        capture_nanos: u64,
+        began_nanos: u64,
+        truth: usize,
+        streamed: Option<StreamedResult>,
+    ) -> Self {
+        Self {
+            tick,
+            agent_frame: None,
+            capture_nanos,
+            latency_ms: None,
+            stamps: StageStamps { began_nanos: Some(began_nanos), ..StageStamps::default() },
+            detected: 0,
+            truth,
+            found: 0,
+            fused: 0,
+            skipped: 0,
+            oldest_ms: None,
+            stale: 0,
+            payload_bytes: 0,
+            wire_bytes: 0,
+            ego_error_m: None,
+            ego_error_deg: None,
+            streamed,
+        }
+    }
 }
 
 /// A result and its ground truth, for pictures.

@@ -3,19 +3,18 @@
 use std::collections::BTreeMap;
 
 use dataset::ground_truth::GroundTruthRule;
-use protocol::{Box3d, CavId, Detection, Detections, DropReason, Pose, PoseEstimate, Stamp, Truth};
+use protocol::{Box3d, CavId, Detections, DropReason, Pose, PoseEstimate, Stamp, Truth};
 use training::average_precision::{Ordering, Scorer};
 
-use super::frame_record::{FrameRecord, JudgedFrame};
-use super::live_precision::{LivePrecision, TickTruth, by_iou};
+use super::frame_record::{FrameRecord, JudgedFrame, StreamedResult};
+use super::live_precision::{Answer, LivePrecision, TickTruth};
 use super::neighbours::{self, NeighbourRecord};
 use super::open_ticks::{OpenTicks, Part, Tick};
+use super::precision::{by_iou, found_by_last};
 use super::stage_stamps::StageStamps;
 use super::true_boxes::true_boxes;
-use crate::score::metrics::{Answered, ByIou, Communication, Latencies, Percentiles, PoseError, PoseErrors};
-
-/// IoU from which a detection counts as found in `frames.csv`.
-const FOUND_IOU: f64 = 0.5;
+use super::truth_line::TruthLine;
+use crate::score::metrics::{ByIou, Communication, Latencies, Percentiles, PoseError, PoseErrors};
 
 /// Gap between two frames beyond which they belong to two scenarios, nanoseconds.
 const SCENARIO_GAP_NANOS: u64 = 10_000_000_000;
@@ -34,7 +33,6 @@ pub struct FrameScores {
     bytes: Vec<(u64, u64)>,
     ages_ms: Vec<f64>,
     neighbours: BTreeMap<CavId, NeighbourRecord>,
-    missed: u64,
     best: Option<JudgedFrame>,
 }
 
@@ -56,7 +54,6 @@ impl FrameScores {
             bytes: Vec::new(),
             ages_ms: Vec::new(),
             neighbours: BTreeMap::new(),
-            missed: 0,
             best: None,
         }
     }
@@ -65,6 +62,20 @@ impl FrameScores {
     pub(crate) fn change_ego(&mut self, ego: &CavId) {
         self.ego.clone_from(ego);
         self.live.forget();
+    }
+
+    /// The ground truth of a tick as it is scored; `None` where the ego takes no part.
+    #[must_use]
+    pub fn truth_line(&self, stamp: &Stamp, truth: &Truth) -> Option<TruthLine> {
+        let ego = truth.agents.iter().find(|agent| agent.cav == self.ego)?;
+        Some(TruthLine {
+            tick: truth.tick,
+            capture_nanos: stamp.capture_nanos,
+            publish_nanos: stamp.publish_nanos,
+            ego: self.ego.clone(),
+            world_from_ego: Some(ego.world_from_lidar),
+            boxes: true_boxes(truth, &self.ego, &self.rule),
+        })
     }
 
     /// Adds the ground truth of a tick.
@@ -89,16 +100,23 @@ impl FrameScores {
         }
     }
 
-    /// Frames scored so far, in order.
+    /// Ticks scored so far, in order, those without a result of the ego included.
     #[must_use]
     pub fn records(&self) -> &[FrameRecord] {
         &self.records
     }
 
+    /// Number of ticks so far, and of those with a result of the ego.
+    #[must_use]
+    pub fn ticks(&self) -> (u64, u64) {
+        self.live.ticks()
+    }
+
     /// Number of ticks without a result of the ego.
     #[must_use]
     pub fn missed(&self) -> u64 {
-        self.missed
+        let (ticks, answered) = self.live.ticks();
+        ticks - answered
     }
 
     /// Frame for the picture so far: the one with the most neighbours, then true boxes.
@@ -107,16 +125,23 @@ impl FrameScores {
         self.best.as_ref()
     }
 
-    /// Average precision, ordered by score over all frames, and ordered by frame.
+    /// Average precision over the answered ticks, ordered by score over all frames, and ordered by frame.
     #[must_use]
     pub fn average_precision(&self) -> (ByIou, ByIou) {
         (by_iou(&self.scorer, Ordering::Global), by_iou(&self.scorer, Ordering::Frame))
     }
 
-    /// Average precision over all ticks, with or without a result; `None` if results have no time of publication.
+    /// Average precision over all ticks, ordered by score; one without a result is a frame without detections.
     #[must_use]
-    pub fn answered(&self) -> Option<Answered> {
-        self.live.answered()
+    pub fn unanswered_empty(&self) -> ByIou {
+        self.live.unanswered_empty()
+    }
+
+    /// Streaming average precision (Li et al. 2020, "Towards Streaming Perception"), ordered by score; `None` if
+    /// results have no time of publication.
+    #[must_use]
+    pub fn streaming(&self) -> Option<ByIou> {
+        self.live.streaming()
     }
 
     /// Id of the ego.
@@ -181,16 +206,19 @@ impl FrameScores {
             return;
         }
         let boxes = true_boxes(&truth, &self.ego, &self.rule);
-        let answer = tick.result.as_ref().map(|(done_nanos, result)| (*done_nanos, &result.detections[..]));
-        self.judge_live(began_nanos, &world_from_lidar, &boxes, answer);
+        let answer = tick
+            .result
+            .as_ref()
+            .map(|(done_nanos, result)| Answer { published_nanos: Some(*done_nanos), detections: &result.detections });
+        let streamed = self.judge_live((truth.tick, began_nanos), &world_from_lidar, &boxes, answer);
         let Some((done_nanos, result)) = tick.result else {
-            self.missed += 1;
-            return;
+            let (tick, truth) = (truth.tick, boxes.len());
+            return self.records.push(FrameRecord::unanswered(tick, capture_nanos, began_nanos, truth, streamed));
         };
         let ego = tick.poses.iter().position(|(cav, _)| *cav == self.ego);
         let posed_nanos = ego.and_then(|ego| tick.posed_nanos.get(ego).copied());
         let stamps = StageStamps::of(began_nanos, posed_nanos, done_nanos, &result.stages);
-        self.judge_result((truth.tick, capture_nanos), stamps, result, boxes, world_from_lidar);
+        self.judge_result((truth.tick, capture_nanos), (stamps, streamed), result, boxes, world_from_lidar);
     }
 
     /// Scores a frame whose truth is known already, at once; `poses` are the estimates of all vehicles. The same frame
@@ -206,31 +234,30 @@ impl FrameScores {
     ) {
         self.judge_poses(poses, &world_from_lidar);
         let stamps = StageStamps { detected_ms: latency_ms, ..StageStamps::default() };
-        if let Some(latency_ms) = latency_ms {
-            let done_nanos = capture_nanos.saturating_add((latency_ms * 1e6) as u64);
-            self.judge_live(capture_nanos, &world_from_lidar, &boxes, Some((done_nanos, &result.detections)));
-        }
-        self.judge_result((tick, capture_nanos), stamps, result, boxes, world_from_lidar);
+        let published_nanos = latency_ms.map(|latency_ms| capture_nanos.saturating_add((latency_ms * 1e6) as u64));
+        let answer = Answer { published_nanos, detections: &result.detections };
+        let streamed = self.judge_live((tick, capture_nanos), &world_from_lidar, &boxes, Some(answer));
+        self.judge_result((tick, capture_nanos), (stamps, streamed), result, boxes, world_from_lidar);
     }
 
-    /// Scores a tick against the truth at its publication, with or without a result.
+    /// Scores a tick with or without a result; returns the result that was the newest at its publication.
     fn judge_live(
         &mut self,
-        began_nanos: u64,
+        (tick, began_nanos): (u64, u64),
         world_from_lidar: &[(CavId, Pose)],
         boxes: &[Box3d],
-        answer: Option<(u64, &[Detection])>,
-    ) {
+        answer: Option<Answer<'_>>,
+    ) -> Option<StreamedResult> {
         let world_from_ego = true_pose(world_from_lidar, &self.ego).copied();
         let ([x_low, x_high], [y_low, y_high]) = (self.rule.x_m, self.rule.y_m);
         let area_m = [x_low, y_low, x_high, y_high];
-        self.live.add(&TickTruth { began_nanos, world_from_ego, boxes, area_m }, answer);
+        self.live.add(&TickTruth { tick, began_nanos, world_from_ego, boxes, area_m }, answer)
     }
 
     fn judge_result(
         &mut self,
         (tick, capture_nanos): (u64, u64),
-        stamps: StageStamps,
+        (stamps, streamed): (StageStamps, Option<StreamedResult>),
         result: Detections,
         boxes: Vec<Box3d>,
         world_from_lidar: Vec<(CavId, Pose)>,
@@ -243,7 +270,7 @@ impl FrameScores {
         let ego_error = ego_error.map(|(found, truth)| PoseError::between(found, truth));
         self.records.push(FrameRecord {
             tick,
-            agent_frame: result.agent_frame,
+            agent_frame: Some(result.agent_frame),
             capture_nanos,
             latency_ms: stamps.detected_ms,
             stamps,
@@ -258,6 +285,7 @@ impl FrameScores {
             wire_bytes: bytes.iter().map(|(_, wire)| wire).sum(),
             ego_error_m: ego_error.map(|error| error.distance_m),
             ego_error_deg: ego_error.map(|error| error.angle_deg),
+            streamed,
         });
         neighbours::add(&mut self.neighbours, &result);
         self.bytes.extend(bytes);
@@ -267,14 +295,8 @@ impl FrameScores {
 
     /// Adds a frame to the scores; returns the number of detections that count as found.
     fn score(&mut self, result: &Detections, boxes: &[Box3d]) -> usize {
-        let tally = |scorer: &Scorer| {
-            scorer.tallies().iter().find(|tally| tally.iou_threshold == FOUND_IOU).map_or(0, |tally| {
-                let first = tally.matched.len().saturating_sub(result.detections.len());
-                tally.matched[first..].iter().filter(|matched| matched.is_true).count()
-            })
-        };
         self.scorer.add(&result.detections, boxes);
-        tally(&self.scorer)
+        found_by_last(&self.scorer, result.detections.len())
     }
 
     fn judge_poses(&mut self, poses: &[(CavId, PoseEstimate)], truth: &[(CavId, Pose)]) {

@@ -1,4 +1,4 @@
-//! Average precision over all ticks of a live run: ticks without a result count, and so does the age of a result.
+//! Average precision over all ticks of a run: ticks without a result count, and so does the age of a result.
 
 use std::collections::VecDeque;
 
@@ -6,7 +6,9 @@ use perception::boxes::postprocess::is_within;
 use protocol::{Box3d, Detection, Pose};
 use training::average_precision::{Ordering, Scorer};
 
-use crate::score::metrics::{Answered, ByIou};
+use super::frame_record::StreamedResult;
+use super::precision::{by_iou, found_by_last};
+use crate::score::metrics::ByIou;
 
 /// Largest number of detections that were published after the ticks scored so far: more than any run has in flight.
 const MOST_KEPT: usize = 64;
@@ -19,17 +21,23 @@ pub(super) struct LivePrecision {
     all_ticks: Scorer,
     streaming: Scorer,
     published: VecDeque<Published>,
+    /// True if a result has no time of publication.
+    is_untimed: bool,
 }
 
-/// Detections, their time of publication and the ego's pose at their capture.
+/// Detections, their time of publication, and tick and pose of the ego at their capture.
 struct Published {
     nanos: u64,
+    tick: u64,
+    began_nanos: u64,
     world_from_ego: Option<Pose>,
     detections: Vec<Detection>,
 }
 
 /// Ground truth of a tick.
 pub(super) struct TickTruth<'a> {
+    /// Tick of the scene.
+    pub(super) tick: u64,
     /// Time of publication of the tick, nanoseconds.
     pub(super) began_nanos: u64,
     /// True pose of the ego's LiDAR.
@@ -40,21 +48,35 @@ pub(super) struct TickTruth<'a> {
     pub(super) area_m: [f64; 4],
 }
 
+/// Detections of a tick.
+pub(super) struct Answer<'a> {
+    /// Time of publication, nanoseconds; `None` without a clock.
+    pub(super) published_nanos: Option<u64>,
+    /// In the ego's LiDAR frame at the capture.
+    pub(super) detections: &'a [Detection],
+}
+
 impl LivePrecision {
-    /// Adds a tick; `answer` holds its detections and their time of publication, nanoseconds, or `None`.
-    pub(super) fn add(&mut self, truth: &TickTruth<'_>, answer: Option<(u64, &[Detection])>) {
+    /// Adds a tick and its detections, if there are some; returns the detections that were newest at that time, with
+    /// their score.
+    pub(super) fn add(&mut self, truth: &TickTruth<'_>, answer: Option<Answer<'_>>) -> Option<StreamedResult> {
         self.ticks += 1;
         self.answered += u64::from(answer.is_some());
-        self.all_ticks.add(answer.map_or(&[], |(_, detections)| detections), truth.boxes);
-        let known = self.newest(truth);
-        self.streaming.add(&known, truth.boxes);
-        if let Some((nanos, detections)) = answer {
-            let (world_from_ego, detections) = (truth.world_from_ego, detections.to_vec());
-            self.published.push_back(Published { nanos, world_from_ego, detections });
-            if self.published.len() > MOST_KEPT {
-                self.published.pop_front();
+        self.all_ticks.add(answer.as_ref().map_or(&[], |answer| answer.detections), truth.boxes);
+        let streamed = self.stream(truth);
+        match answer {
+            Some(Answer { published_nanos: Some(nanos), detections }) => {
+                let TickTruth { tick, began_nanos, world_from_ego, .. } = *truth;
+                let detections = detections.to_vec();
+                self.published.push_back(Published { nanos, tick, began_nanos, world_from_ego, detections });
+                if self.published.len() > MOST_KEPT {
+                    self.published.pop_front();
+                }
             }
+            Some(Answer { published_nanos: None, .. }) => self.is_untimed = true,
+            None => {}
         }
+        streamed
     }
 
     /// Another scenario begins: detections of the previous one do not apply to it.
@@ -62,24 +84,36 @@ impl LivePrecision {
         self.published.clear();
     }
 
-    /// The precision; `None` without ticks.
-    pub(super) fn answered(&self) -> Option<Answered> {
-        (self.ticks > 0).then(|| Answered {
-            answered: self.answered,
-            ticks: self.ticks,
-            ap_all_ticks: by_iou(&self.all_ticks, Ordering::Global),
-            streaming_ap: by_iou(&self.streaming, Ordering::Global),
-        })
+    /// Number of ticks so far, and of those with a result.
+    pub(super) fn ticks(&self) -> (u64, u64) {
+        (self.ticks, self.answered)
+    }
+
+    /// Average precision ordered by score; a tick without a result is a frame without detections.
+    pub(super) fn unanswered_empty(&self) -> ByIou {
+        by_iou(&self.all_ticks, Ordering::Global)
+    }
+
+    /// Streaming average precision, ordered by score; `None` if results have no time of publication.
+    pub(super) fn streaming(&self) -> Option<ByIou> {
+        (self.ticks > 0 && !self.is_untimed).then(|| by_iou(&self.streaming, Ordering::Global))
+    }
+
+    /// Scores the detections that are newest at a tick.
+    fn stream(&mut self, truth: &TickTruth<'_>) -> Option<StreamedResult> {
+        let known = self.newest(truth);
+        let detections = known.as_ref().map_or(&[][..], |(_, detections)| detections);
+        self.streaming.add(detections, truth.boxes);
+        let found = found_by_last(&self.streaming, detections.len());
+        known.map(|(of, detections)| StreamedResult { detected: detections.len(), found, ..of })
     }
 
     /// The detections of the newest sweep that were published by a tick, moved to the ego's pose at that tick. Older
     /// ones are dropped.
-    fn newest(&mut self, truth: &TickTruth<'_>) -> Vec<Detection> {
-        let Some(index) = self.published.iter().rposition(|published| published.nanos <= truth.began_nanos) else {
-            return Vec::new();
-        };
+    fn newest(&mut self, truth: &TickTruth<'_>) -> Option<(StreamedResult, Vec<Detection>)> {
+        let index = self.published.iter().rposition(|published| published.nanos <= truth.began_nanos)?;
         self.published.drain(..index);
-        let Some(Published { world_from_ego, detections, .. }) = self.published.front() else { return Vec::new() };
+        let Published { tick, began_nanos, world_from_ego, detections, .. } = self.published.front()?;
         let now_from_then = match (truth.world_from_ego, world_from_ego) {
             (Some(now), Some(then)) => now.from_world(then).isometry(),
             _ => Pose::IDENTITY.isometry(),
@@ -88,16 +122,9 @@ impl LivePrecision {
             let box3d = found.box3d.transformed(&now_from_then);
             Detection { box3d, ..found.clone() }
         });
-        moved.filter(|found| is_within(&found.box3d.corners(), truth.area_m)).collect()
-    }
-}
-
-/// AP at the three IoU thresholds; `None` without a true object.
-pub(super) fn by_iou(scorer: &Scorer, ordering: Ordering) -> ByIou {
-    let objects = scorer.tallies().first().map_or(0, |tally| tally.objects);
-    match scorer.average_precisions(ordering)[..] {
-        [at_30, at_50, at_70] if objects > 0 => ByIou { at_30: Some(at_30), at_50: Some(at_50), at_70: Some(at_70) },
-        _ => ByIou::default(),
+        let within = moved.filter(|found| is_within(&found.box3d.corners(), truth.area_m)).collect();
+        let age_ms = (truth.began_nanos.saturating_sub(*began_nanos)) as f64 * 1e-6;
+        Some((StreamedResult { tick: *tick, age_ms, detected: 0, found: 0 }, within))
     }
 }
 
@@ -113,41 +140,59 @@ mod tests {
 
     /// The ego drives 1 m along x from tick to tick, ten a second, towards a car that stands at 20 m in the world; the
     /// ticks in `answered` have results that contain it, with the given latency.
-    fn run(ticks: u64, answered: &[u64], latency_ms: u64, speed_m: f64) -> Answered {
+    fn run(
+        ticks: u64,
+        answered: &[u64],
+        latency_ms: u64,
+        speed_m: f64,
+    ) -> (LivePrecision, Vec<Option<StreamedResult>>) {
         let mut live = LivePrecision::default();
-        for tick in 0..ticks {
+        let streamed = (0..ticks).map(|tick| {
             let began_nanos = 1_000_000_000 + tick * 100_000_000;
             let ego_x = tick as f64;
             let boxes = [car(20.0 + speed_m * tick as f64 - ego_x)];
             let world_from_ego = Some(Pose::from_xyz_yaw([ego_x, 0.0, 0.0], 0.0));
             let found = [Detection { box3d: boxes[0], score: 0.9, source: None }];
-            let answer = answered.contains(&tick).then_some((began_nanos + latency_ms * 1_000_000, &found[..]));
-            live.add(&TickTruth { began_nanos, world_from_ego, boxes: &boxes, area_m: AREA_M }, answer);
-        }
-        live.answered().unwrap()
+            let published_nanos = Some(began_nanos + latency_ms * 1_000_000);
+            let answer = answered.contains(&tick).then_some(Answer { published_nanos, detections: &found });
+            live.add(&TickTruth { tick, began_nanos, world_from_ego, boxes: &boxes, area_m: AREA_M }, answer)
+        });
+        let streamed = streamed.collect();
+        (live, streamed)
+    }
+
+    fn streaming(ticks: u64, answered: &[u64], latency_ms: u64, speed_m: f64) -> ByIou {
+        run(ticks, answered, latency_ms, speed_m).0.streaming().unwrap()
     }
 
     #[test]
     fn an_unanswered_tick_is_a_frame_without_detections() {
-        let score = run(4, &[0, 2, 3], 50, 0.0);
-        assert_eq!((score.answered, score.ticks), (3, 4));
-        assert_eq!(score.ap_all_ticks.at_50, Some(0.75));
+        let (live, _) = run(4, &[0, 2, 3], 50, 0.0);
+        assert_eq!(live.ticks(), (4, 3));
+        assert_eq!(live.unanswered_empty().at_50, Some(0.75));
     }
 
     #[test]
     fn the_last_answer_serves_until_the_next_and_the_egos_own_motion_does_not_spoil_it() {
         // Nothing is published by the first tick; its result serves the three that follow.
-        assert_eq!(run(4, &[0], 50, 0.0).streaming_ap.at_70, Some(0.75));
+        assert_eq!(streaming(4, &[0], 50, 0.0).at_70, Some(0.75));
         // A result that takes 250 ms serves from the third tick after its own on.
-        assert_eq!(run(4, &[0, 1, 2, 3], 250, 0.0).streaming_ap.at_70, Some(0.25));
+        assert_eq!(streaming(4, &[0, 1, 2, 3], 250, 0.0).at_70, Some(0.25));
+    }
+
+    #[test]
+    fn each_tick_names_the_result_that_it_was_scored_with() {
+        let (_, streamed) = run(4, &[0, 2], 150, 0.0);
+        let of_first = |age_ms| Some(StreamedResult { tick: 0, age_ms, detected: 1, found: 1 });
+        assert_eq!(streamed, [None, None, of_first(200.0), of_first(300.0)]);
     }
 
     #[test]
     fn what_moves_is_no_longer_where_it_was_found() {
         // 0.5 m a tick and results that are one tick old: an overlap of 0.78. Two ticks old: 0.6.
         let is_near = |found: Option<f64>, expected: f64| (found.unwrap() - expected).abs() < 1e-9;
-        assert!(is_near(run(5, &[0, 1, 2, 3, 4], 100, 0.5).streaming_ap.at_70, 0.8));
-        let late = run(5, &[0, 1, 2, 3, 4], 200, 0.5).streaming_ap;
+        assert!(is_near(streaming(5, &[0, 1, 2, 3, 4], 100, 0.5).at_70, 0.8));
+        let late = streaming(5, &[0, 1, 2, 3, 4], 200, 0.5);
         assert!(is_near(late.at_50, 0.6) && is_near(late.at_70, 0.0), "{late:?}");
     }
 
@@ -155,15 +200,24 @@ mod tests {
     fn boxes_that_the_ego_has_passed_are_not_judged() {
         let mut live = LivePrecision::default();
         let found = [Detection { box3d: car(-48.0), score: 0.9, source: None }];
-        for (tick, boxes) in [vec![car(-48.0)], vec![car(10.0)]].iter().enumerate() {
-            let began_nanos = 1_000 * tick as u64;
+        for (tick, boxes) in (0..).zip(&[vec![car(-48.0)], vec![car(10.0)]]) {
+            let began_nanos = 1_000 * tick;
             let world_from_ego = Some(Pose::from_xyz_yaw([5.0 * tick as f64, 0.0, 0.0], 0.0));
-            let answer = (tick == 0).then_some((began_nanos, &found[..]));
-            live.add(&TickTruth { began_nanos, world_from_ego, boxes, area_m: AREA_M }, answer);
+            let answer = (tick == 0).then_some(Answer { published_nanos: Some(began_nanos), detections: &found });
+            live.add(&TickTruth { tick, began_nanos, world_from_ego, boxes, area_m: AREA_M }, answer);
         }
         assert_eq!(live.streaming.tallies()[0].matched, [], "it is behind the area at the second tick");
         live.forget();
         assert_eq!((live.published.len(), live.ticks), (0, 2));
-        assert!(LivePrecision::default().answered().is_none());
+        assert!(LivePrecision::default().streaming().is_none());
+    }
+
+    #[test]
+    fn results_without_a_time_have_no_streaming_precision() {
+        let mut live = LivePrecision::default();
+        let (boxes, found) = ([car(10.0)], [Detection { box3d: car(10.0), score: 0.9, source: None }]);
+        let truth = TickTruth { tick: 0, began_nanos: 0, world_from_ego: None, boxes: &boxes, area_m: AREA_M };
+        live.add(&truth, Some(Answer { published_nanos: None, detections: &found }));
+        assert_eq!((live.streaming(), live.unanswered_empty().at_70), (None, Some(1.0)));
     }
 }

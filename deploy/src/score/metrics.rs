@@ -1,6 +1,5 @@
 //! `metrics.json`: metrics of a run and their definitions.
 
-mod answered;
 mod contribution;
 
 use std::collections::BTreeMap;
@@ -14,7 +13,6 @@ use support::statistics::{quantile, sorted};
 
 use crate::score::{FrameScores, NeighbourRecord};
 
-pub use answered::Answered;
 pub use contribution::Contribution;
 
 /// Pose error below which localization counts as a success, metres.
@@ -25,6 +23,12 @@ const SUCCESS_M: f64 = 3.0;
 pub struct Metrics {
     /// Number of frames that the ego reported.
     pub frames: u64,
+    /// Number of ticks of the scene; without a network all are answered.
+    #[serde(default)]
+    pub ticks: u64,
+    /// Number of ticks with detections; the others are unanswered.
+    #[serde(default)]
+    pub answered: u64,
     /// From the first to the last detections, seconds of wall time.
     pub seconds: f64,
     /// Clock of the run.
@@ -33,14 +37,22 @@ pub struct Metrics {
     pub method: String,
     /// Name of the pose source.
     pub pose_source: String,
-    /// Average precision with detections ordered by score over all frames, by IoU threshold. The headline.
+    /// Average precision over the answered ticks, with detections ordered by score over all frames, by IoU threshold.
+    /// The headline of runs that answer all.
     pub ap_global: ByIou,
     /// Average precision with detections in frame order, by score only within a frame, as the reference code does.
     pub ap_frame_order: ByIou,
-    /// Average precision over all ticks, those without a report included; `null` if results have no time of
-    /// publication.
+    /// `ap_global` under the name that says over which ticks it is.
     #[serde(default)]
-    pub answered: Option<Answered>,
+    pub ap_answered: ByIou,
+    /// The same over all ticks; an unanswered one is a frame without detections.
+    #[serde(default)]
+    pub ap_unanswered_empty: ByIou,
+    /// Streaming average precision (Li et al. 2020, "Towards Streaming Perception"), ordered by score: at each tick the
+    /// last detections published until then are moved by the ego's true motion since their capture and compared with
+    /// the truth at that tick. Latency and missing results both lower it. `null` if results have no time of publication.
+    #[serde(default)]
+    pub ap_streaming: Option<ByIou>,
     /// Errors of the poses that fusion used.
     pub pose: PoseErrors,
     /// Latencies.
@@ -80,20 +92,25 @@ impl Metrics {
     ) -> Self {
         let fused = board.records().iter().map(|record| record.fused).sum();
         let (ap_global, ap_frame_order) = board.average_precision();
+        let (ticks, answered) = board.ticks();
         Self {
-            frames: board.records().len() as u64,
+            frames: answered,
+            ticks,
+            answered,
             seconds,
             clock: clock.into(),
             method: method.into(),
             pose_source: pose_source.into(),
             ap_global,
             ap_frame_order,
-            answered: board.answered(),
+            ap_answered: ap_global,
+            ap_unanswered_empty: board.unanswered_empty(),
+            ap_streaming: board.streaming(),
             pose: board.pose_errors(),
             latency_ms: board.latencies(),
             age_ms: board.ages(),
             comm: board.communication(),
-            contribution: Contribution::of(board.records().len(), fused, board.ego(), ledger, sent_bytes),
+            contribution: Contribution::of(answered, fused, board.ego(), ledger, sent_bytes),
             neighbours: board.neighbours().clone(),
             messages: Messages::of(&ledger.total()),
             protocol: None,
@@ -243,8 +260,52 @@ fn mean(values: impl ExactSizeIterator<Item = f64>) -> Option<f64> {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
+
+    /// Metrics of 60 frames of which nothing else is known.
+    pub(crate) fn metrics(method: &str) -> Metrics {
+        Metrics {
+            frames: 60,
+            ticks: 60,
+            answered: 60,
+            seconds: 6.0,
+            clock: "wall".into(),
+            method: method.into(),
+            pose_source: "recorded".into(),
+            ap_global: ByIou::default(),
+            ap_frame_order: ByIou::default(),
+            ap_answered: ByIou::default(),
+            ap_unanswered_empty: ByIou::default(),
+            ap_streaming: None,
+            pose: PoseErrors::default(),
+            latency_ms: Latencies::default(),
+            age_ms: Percentiles::default(),
+            comm: Communication::default(),
+            contribution: Contribution::default(),
+            neighbours: BTreeMap::new(),
+            messages: Messages::default(),
+            protocol: None,
+            left_out: LeftOut::default(),
+        }
+    }
+
+    #[test]
+    fn the_file_names_the_three_precisions() {
+        let ap = |at_50| ByIou { at_50: Some(at_50), ..ByIou::default() };
+        let metrics = Metrics {
+            answered: 29,
+            ap_answered: ap(0.9),
+            ap_unanswered_empty: ap(0.5),
+            ap_streaming: Some(ap(0.25)),
+            ..metrics("pastat")
+        };
+        let json = serde_json::to_value(&metrics).unwrap();
+        assert_eq!((&json["answered"], &json["ticks"]), (&29.into(), &60.into()));
+        let at_50 = ["ap_answered", "ap_unanswered_empty", "ap_streaming"].map(|name| json[name]["0.5"].as_f64());
+        assert_eq!(at_50, [Some(0.9), Some(0.5), Some(0.25)]);
+        assert_eq!(serde_json::from_value::<Metrics>(json).unwrap(), metrics);
+    }
 
     #[test]
     fn quantiles_lie_between_neighbours() {

@@ -10,15 +10,18 @@ mod node;
 mod numbered_results;
 pub(crate) mod offline_intervals;
 mod open_ticks;
+mod precision;
 mod result_lines;
 mod stage_stamps;
 mod true_boxes;
+mod truth_line;
 
 pub use frame_record::FrameRecord;
 
-pub(crate) use frame_record::JudgedFrame;
+pub(crate) use frame_record::{JudgedFrame, StreamedResult};
 pub use frame_scores::FrameScores;
 pub use neighbours::NeighbourRecord;
 pub use node::{ProcessStats, Progress, Scored, ScorerError};
 pub(crate) use node::{ScorerNode, scorer_cav};
 pub(crate) use stage_stamps::StageStamps;
+pub use truth_line::TruthLine;

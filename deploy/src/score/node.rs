@@ -7,10 +7,10 @@ use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use bus::bounded_queue::Pop;
-use bus::{Arrival, Bus, BusError, Event, Identity, Inbox, LivelinessToken, Subscription, process_id};
+use bus::{Arrival, Bus, BusError, Event, Identity, Inbox, LivelinessToken, Subscription, process_id, process_usage};
 use protocol::{
-    CavId, Detections, DetectionsReport, KeyExpr, Ledger, Limits, NeighbourState, PoseEstimate, ProcessId, Role, RunId,
-    StageSummary, Stats, Stream, Topic, Truth,
+    CavId, Detections, DetectionsReport, KeyExpr, Ledger, Limits, NeighbourState, PoseEstimate, ProcessId,
+    ProcessUsage, Role, RunId, StageSummary, Stats, Stream, Topic, TopicTraffic, Truth,
 };
 use zenoh::Session;
 
@@ -61,7 +61,7 @@ impl Progress {
     }
 }
 
-/// Ledger of one process instance.
+/// Ledger and resources of one process instance.
 #[derive(Debug, Clone)]
 pub struct ProcessStats {
     /// Name of the process.
@@ -70,6 +70,12 @@ pub struct ProcessStats {
     pub ledger: Ledger,
     /// Its stages.
     pub stages: Vec<StageSummary>,
+    /// Its CPU time and memory.
+    pub usage: ProcessUsage,
+    /// CPU time before the first tick, seconds: for loading models and for joining the run.
+    pub cpu_before_s: f64,
+    /// Its published bytes, by topic.
+    pub traffic: Vec<TopicTraffic>,
 }
 
 /// Largest number of process instances whose ledgers are kept: a fleet of 65 vehicles that all crash a few times.
@@ -86,8 +92,8 @@ pub struct Scored {
     pub stats: Vec<ProcessStats>,
     /// Progress of the run.
     pub progress: Progress,
-    /// Number of results that are not in the file, for lack of disk space.
-    pub unwritten: u64,
+    /// Number of results and of ticks that are not in their files, for lack of disk space.
+    pub unwritten: [u64; 2],
 }
 
 /// Reason why the scorer cannot start.
@@ -111,15 +117,15 @@ pub(crate) struct ScorerNode {
     bus: Bus,
     inbox: Arc<Inbox>,
     progress: Arc<Mutex<Progress>>,
-    thread: JoinHandle<(FrameScores, ScoreStats, u64)>,
+    thread: JoinHandle<(FrameScores, ScoreStats, [u64; 2])>,
     offline: OfflineIntervals,
     _subscriptions: Vec<Subscription>,
     _presence: LivelinessToken,
 }
 
 impl ScorerNode {
-    /// Subscribes to the run of `agents` on `session`; results are appended to `detections_file`, one JSON object a
-    /// line.
+    /// Subscribes to the run of `agents` on `session`; results and ground truth are appended to `files`, one JSON object
+    /// a line.
     ///
     /// # Errors
     /// [`ScorerError`] when the bus, the file or the system refuses.
@@ -129,7 +135,7 @@ impl ScorerNode {
         agents: &[CavId],
         ego: &CavId,
         board: FrameScores,
-        detections_file: PathBuf,
+        files: [PathBuf; 2],
     ) -> Result<Self, ScorerError> {
         let cav = scorer_cav();
         let process = process_id(Role::Scorer, &cav);
@@ -147,7 +153,9 @@ impl ScorerNode {
         let presence = bus.announce(Role::Scorer)?;
         let offline = OfflineIntervals::watch(&bus)?;
         let io = |what: String| move |source| ScorerError::Io { what, source };
-        let detections = ResultLines::create(&detections_file).map_err(io(detections_file.display().to_string()))?;
+        let lines = |file: &PathBuf| ResultLines::create(file).map_err(io(file.display().to_string()));
+        let [detections, truth] = &files;
+        let (detections, truth_lines) = (lines(detections)?, lines(truth)?);
         let progress = Arc::<Mutex<Progress>>::default();
         let worker = Worker {
             inbox: Arc::clone(&inbox),
@@ -156,6 +164,7 @@ impl ScorerNode {
             stats: BTreeMap::new(),
             progress: Arc::clone(&progress),
             detections,
+            truth_lines,
             numbered: NumberedResults::default(),
             published: BTreeMap::new(),
         };
@@ -193,10 +202,16 @@ impl ScorerNode {
     pub(crate) fn finish(self) -> Scored {
         self.inbox.close();
         let (board, stats, unwritten) = self.thread.join().expect("the scorer's thread has no reason to panic");
+        let own_stats = self.bus.stats();
+        let process = self.bus.identity().process.clone();
+        let cpu_before_s = stats.values().find(|stats| stats.process == process).map_or(0.0, |own| own.cpu_before_s);
         let own = ProcessStats {
-            process: self.bus.identity().process.clone(),
-            ledger: self.bus.stats().ledger(),
-            stages: self.bus.stats().stages(),
+            process,
+            ledger: own_stats.ledger(),
+            stages: own_stats.stages(),
+            usage: process_usage(),
+            cpu_before_s,
+            traffic: own_stats.traffic(),
         };
         let progress = self.progress.lock().unwrap_or_else(PoisonError::into_inner).clone();
         drop((self._subscriptions, self._presence, self.offline));
@@ -226,13 +241,14 @@ struct Worker {
     stats: ScoreStats,
     progress: Arc<Mutex<Progress>>,
     detections: ResultLines,
+    truth_lines: ResultLines,
     numbered: NumberedResults,
     // Time of publication of each recent tick, by capture time: for the latency that is displayed during the run.
     published: BTreeMap<u64, u64>,
 }
 
 impl Worker {
-    fn run(mut self) -> (FrameScores, ScoreStats, u64) {
+    fn run(mut self) -> (FrameScores, ScoreStats, [u64; 2]) {
         loop {
             match self.inbox.take(None) {
                 Pop::Item(topic, Event::Message(arrival)) => self.take(&topic, &arrival),
@@ -243,7 +259,7 @@ impl Worker {
         }
         self.write_results(true);
         self.board.close();
-        (self.board, self.stats, self.detections.finish())
+        (self.board, self.stats, [self.detections.finish(), self.truth_lines.finish()])
     }
 
     fn take(&mut self, topic: &Topic, arrival: &Arrival) {
@@ -268,8 +284,12 @@ impl Worker {
             self.published.pop_first();
         }
         self.numbered.tick(stamp.capture_nanos, truth.tick);
+        if let Some(line) = self.board.truth_line(stamp, &truth) {
+            self.truth_lines.add(line.to_json());
+        }
         self.board.truth(stamp, truth);
         self.write_results(false);
+        self.bus_stats.tick();
         self.note(|progress| progress.ticks += 1);
         Some(())
     }
@@ -284,6 +304,8 @@ impl Worker {
         let neighbours = result.neighbours.clone();
         let (fused, bytes) =
             (result.fused.len(), result.fused.iter().map(|neighbour| neighbour.wire_bytes).sum::<u64>());
+        let latency = latency_ms.map(|ms| Duration::from_secs_f64(ms.max(0.0) / 1e3));
+        self.bus_stats.answered(latency, fused);
         let at = arrival.at;
         self.note(|progress| {
             progress.frames += 1;
@@ -300,7 +322,7 @@ impl Worker {
     /// Writes the results whose tick is known, or will not be.
     fn write_results(&mut self, is_over: bool) {
         while let Some(report) = self.numbered.next(is_over) {
-            self.detections.add(&report);
+            self.detections.add(report.to_json());
         }
     }
 
@@ -311,7 +333,10 @@ impl Worker {
     }
 
     fn stats(&mut self, sender: &ProcessId, arrival: &Arrival) {
-        let Some(Stats { process, ledger, stages }) = self.inbox.decode(arrival, &Limits::DEFAULT) else { return };
+        let Some(Stats { process, ledger, stages, usage, traffic }) = self.inbox.decode(arrival, &Limits::DEFAULT)
+        else {
+            return;
+        };
         // A restarted process has another epoch: both instances count.
         let instance = (process.clone(), arrival.header.stamp.epoch);
         let has_room = self.stats.len() < MAX_INSTANCES || self.stats.contains_key(&instance);
@@ -319,7 +344,13 @@ impl Worker {
             return tracing::warn!(%sender, %process, "report with another process's name, or of too many processes: ignored");
         }
         let (name, at) = (process.to_string(), arrival.at);
-        self.stats.insert(instance, ProcessStats { process, ledger, stages });
+        // Until the first tick: the loading of models belongs to no frame.
+        let cpu_before_s = match self.published.is_empty() {
+            true => usage.cpu_s,
+            false => self.stats.get(&instance).map_or(0.0, |known| known.cpu_before_s),
+        };
+        let stats = ProcessStats { process, ledger, stages, usage, cpu_before_s, traffic };
+        self.stats.insert(instance, stats);
         let dropped = self.stats.values().map(|stats| stats.ledger.total().dropped_total()).sum();
         self.note(|progress| {
             progress.dropped = dropped;

@@ -1,16 +1,16 @@
-//! `detections.jsonl`: a line per result, appended during the run.
+//! `detections.jsonl` and `truth.jsonl`: a line per result or tick, appended during the run.
 
 use std::fs::File;
 use std::io::{self, BufWriter, Write};
 use std::path::Path;
 
-use protocol::DetectionsReport;
-
-/// Size of the buffer that waits for a full disk, bytes: some hundred results.
+/// Size of the buffer that waits for a full disk, bytes: some hundred lines.
 const WAITING: usize = 1 << 20;
 
-/// The file. A full disk ends no run: results without room are counted.
+/// The file. A full disk ends no run: lines without room are counted.
 pub(super) struct ResultLines<W: Write = File> {
+    /// File name.
+    name: String,
     out: BufWriter<W>,
     /// Lines since the last complete flush.
     waiting: u64,
@@ -20,18 +20,19 @@ pub(super) struct ResultLines<W: Write = File> {
 
 impl ResultLines {
     pub(super) fn create(path: &Path) -> io::Result<Self> {
-        File::create(path).map(Self::over)
+        let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        File::create(path).map(|file| Self::over(name, file))
     }
 }
 
 impl<W: Write> ResultLines<W> {
-    fn over(out: W) -> Self {
-        Self { out: BufWriter::with_capacity(WAITING, out), waiting: 0, lost: 0, has_complained: false }
+    fn over(name: String, out: W) -> Self {
+        Self { name, out: BufWriter::with_capacity(WAITING, out), waiting: 0, lost: 0, has_complained: false }
     }
 
     /// Adds a line; another process may be reading the file.
-    pub(super) fn add(&mut self, report: &DetectionsReport) {
-        let line = report.to_json() + "\n";
+    pub(super) fn add(&mut self, json: String) {
+        let line = json + "\n";
         // All or nothing: a line that does not fit into the buffer is not begun.
         let has_room = self.out.buffer().len() + line.len() <= WAITING || self.out.flush().is_ok();
         match has_room.then(|| self.out.write_all(line.as_bytes())) {
@@ -42,13 +43,13 @@ impl<W: Write> ResultLines<W> {
             Ok(()) => (self.waiting, self.has_complained) = (0, false),
             Err(error) if !self.has_complained => {
                 self.has_complained = true;
-                tracing::error!("detections.jsonl waits: {error}");
+                tracing::error!("{} waits: {error}", self.name);
             }
             Err(_) => {}
         }
     }
 
-    /// Number of results that are not in the file.
+    /// Number of lines that are not in the file.
     pub(super) fn finish(mut self) -> u64 {
         let is_written = self.out.flush().is_ok();
         // The rest of the buffer is not tried once more.
@@ -61,7 +62,7 @@ impl<W: Write> ResultLines<W> {
 mod tests {
     use std::sync::{Arc, Mutex};
 
-    use protocol::{CavId, Detections, Pose, PoseEstimate, Stamp};
+    use protocol::{CavId, Detections, DetectionsReport, Pose, PoseEstimate, Stamp};
 
     use super::*;
 
@@ -114,30 +115,30 @@ mod tests {
     #[test]
     fn what_waits_for_a_full_disk_is_written_whole_when_there_is_room_again() {
         let disk = Disk::default();
-        let mut lines = ResultLines::over(disk.clone());
+        let mut lines = ResultLines::over("test.jsonl".into(), disk.clone());
         disk.make_room(report(0).to_json().len() + 7);
-        (0..5).for_each(|tick| lines.add(&report(tick)));
+        (0..5).for_each(|tick| lines.add(report(tick).to_json()));
         disk.make_room(1 << 30);
-        lines.add(&report(5));
+        lines.add(report(5).to_json());
         assert_eq!((lines.finish(), disk.lines().len()), (0, 6));
     }
 
     #[test]
     fn what_finds_no_room_is_counted() {
         let disk = Disk::default();
-        let mut lines = ResultLines::over(disk.clone());
+        let mut lines = ResultLines::over("test.jsonl".into(), disk.clone());
         let fitting = WAITING / (report(10).to_json().len() + 1);
-        (0..fitting + 30).for_each(|tick| lines.add(&report(10 + tick as u64 % 10)));
+        (0..fitting + 30).for_each(|tick| lines.add(report(10 + tick as u64 % 10).to_json()));
         assert_eq!((lines.lost, lines.waiting as usize), (30, fitting));
         disk.make_room(1 << 30);
-        lines.add(&report(99));
+        lines.add(report(99).to_json());
         assert_eq!(lines.finish(), 30);
         let written = disk.lines();
         assert_eq!((written.len(), &written[fitting]["tick"]), (fitting + 1, &99.into()));
 
         let full = Disk::default();
-        let mut lines = ResultLines::over(full.clone());
-        (0..3).for_each(|tick| lines.add(&report(tick)));
+        let mut lines = ResultLines::over("test.jsonl".into(), full.clone());
+        (0..3).for_each(|tick| lines.add(report(tick).to_json()));
         assert_eq!((lines.finish(), full.lines().len()), (3, 0));
     }
 }

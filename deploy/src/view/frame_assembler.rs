@@ -7,6 +7,7 @@ use protocol::{
     StageSummary, Stats, Stream, Topic, TrueObject, Truth, wire,
 };
 
+use super::pace_counter::{PaceCounter, ShownPace};
 use super::scene_frame::{Link, Messages, POINT_BYTES, Planar, Process, SceneFrame, ShownBox, Vehicle, decimate};
 
 /// Largest number of incomplete scene frames.
@@ -39,6 +40,7 @@ pub(crate) struct FrameAssembler {
     ledgers: BTreeMap<String, (Ledger, Vec<StageSummary>)>,
     /// Vehicles with at least one message.
     vehicles: BTreeSet<CavId>,
+    pace: PaceCounter,
 }
 
 /// Messages of one scene frame.
@@ -101,9 +103,14 @@ impl FrameAssembler {
     /// The scene frame at `capture_nanos` with the messages so far; older ones are dropped.
     pub(crate) fn show(&mut self, capture_nanos: u64) -> Option<SceneFrame> {
         let frame = self.open.remove(&capture_nanos)?;
-        self.open.retain(|at, _| *at > capture_nanos);
+        let later = self.open.split_off(&capture_nanos);
+        // Older ones will have no result any more.
+        let closed = std::mem::replace(&mut self.open, later);
+        let ticks = closed.values().chain([&frame]).filter(|frame| frame.truth.is_some());
+        ticks.for_each(|frame| self.pace.tick(frame.result.as_ref().map(|(published, _)| *published)));
         self.shown_until = Some(capture_nanos);
-        Some(frame.frame(capture_nanos, &self.ledgers))
+        let shown = frame.frame(capture_nanos, &self.ledgers);
+        Some(SceneFrame { pace: self.pace.pace(), ..shown })
     }
 
     /// Forgets which scene frames were shown: a recording is shown in any order.
@@ -112,7 +119,7 @@ impl FrameAssembler {
     }
 
     fn keep_ledger(&mut self, seen: &ReceivedMessage<'_>) {
-        let Some(Stats { process, ledger, stages }) = decode(seen) else { return };
+        let Some(Stats { process, ledger, stages, .. }) = decode(seen) else { return };
         let process = process.to_string();
         if self.ledgers.len() < MOST_LEDGERS || self.ledgers.contains_key(&process) {
             self.ledgers.insert(process, (ledger, stages));
@@ -212,6 +219,7 @@ impl OpenFrame {
             single: self.single(),
             links: self.links(),
             stages: result.map_or(Vec::new(), |result| result.stages.clone()),
+            pace: ShownPace::default(),
             processes: ledgers
                 .iter()
                 .map(|(process, (_, stages))| Process { process: process.clone(), stages: stages.clone() })

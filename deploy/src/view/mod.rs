@@ -6,6 +6,7 @@
 
 mod frame_assembler;
 mod live;
+mod pace_counter;
 pub mod picture;
 mod recorded;
 mod scene_frame;
@@ -14,6 +15,7 @@ mod server;
 mod tests;
 
 pub use live::LiveRun;
+pub use pace_counter::ShownPace;
 pub use recorded::{RecordedRun, ViewError};
 pub use scene_frame::SceneFrame;
 pub use server::{serve_live, serve_recorded};

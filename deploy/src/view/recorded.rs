@@ -9,6 +9,7 @@ use recording::{Entry, Recording, RecordingError};
 use serde::Serialize;
 
 use super::frame_assembler::{FrameAssembler, ReceivedMessage};
+use super::pace_counter::PaceCounter;
 use super::scene_frame::SceneFrame;
 use crate::operate::run_folder::{RECORDING, SWEEP_LOG};
 
@@ -35,6 +36,7 @@ pub struct RecordedRun {
     swept: BTreeMap<u64, u64>,
     /// Entries with the reports of all processes.
     stats: Vec<usize>,
+    pace: PaceCounter,
     assembly: Mutex<FrameAssembler>,
 }
 
@@ -91,11 +93,15 @@ impl RecordedRun {
             }
         }
         let swept = agent::sweep_log::read(&file.with_file_name(SWEEP_LOG)).unwrap_or_default();
-        let mut run = Self { recording, name, moments: Vec::new(), swept, stats, assembly: Mutex::default() };
+        let (pace, assembly) = (PaceCounter::default(), Mutex::default());
+        let mut run = Self { recording, name, moments: Vec::new(), swept, stats, pace, assembly };
         for (capture_nanos, entries) in moments {
             if let Some(summary) = run.summary(capture_nanos, &entries)? {
                 let truth = entries.iter().map(|index| run.entry(*index)).find(|entry| entry.key.topic == Topic::Truth);
                 let began_nanos = truth.map(|entry| entry.header.stamp.publish_nanos);
+                if let Some(began) = began_nanos {
+                    run.pace.tick(summary.latency_ms.map(|latency_ms| began.saturating_add((latency_ms * 1e6) as u64)));
+                }
                 run.moments.push(Moment { capture_nanos, began_nanos, entries, summary });
             }
         }
@@ -152,7 +158,8 @@ impl RecordedRun {
 
     fn with_sweep(&self, frame: SceneFrame, moment: &Moment) -> SceneFrame {
         let swept = self.swept.get(&moment.capture_nanos).zip(moment.began_nanos);
-        SceneFrame { swept_ms: swept.map(|(swept, began)| (*swept as f64 - began as f64) / 1e6), ..frame }
+        let swept_ms = swept.map(|(swept, began)| (*swept as f64 - began as f64) / 1e6);
+        SceneFrame { swept_ms, pace: self.pace.pace(), ..frame }
     }
 
     fn entry(&self, index: usize) -> &Entry {

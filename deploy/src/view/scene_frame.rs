@@ -7,6 +7,8 @@ use protocol::{
 };
 use serde::{Serialize, Serializer};
 
+use super::pace_counter::ShownPace;
+
 /// Largest number of points of one sweep on the page: more than a screen has pixels for them.
 const MAX_POINTS: usize = 12_000;
 /// Bytes of a point as sent to the page.
@@ -44,6 +46,8 @@ pub struct SceneFrame {
     pub links: Vec<Link>,
     /// Durations of the ego's stages.
     pub stages: Vec<StageTiming>,
+    /// Answered ticks and rate: live until this frame, recorded of the whole run.
+    pub pace: ShownPace,
     /// Durations of the stages of each process.
     pub processes: Vec<Process>,
     /// Messages of all processes so far, by topic and receiver.

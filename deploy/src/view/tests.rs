@@ -161,6 +161,7 @@ fn a_recorded_run_is_shown_in_any_order() {
         assert_eq!(frame["tick"], index);
         check(&frame, points);
         assert!(points > 10_000, "two sweeps");
+        assert_eq!(frame["pace"], serde_json::json!({"ticks": 5, "answered": 5, "rate_hz": 1.0}));
         assert_eq!((&frame["swept_ms"], &frame["posed_ms"]), (&3.0.into(), &20.0.into()));
     }
     assert!(run.frame(5).unwrap().is_none());
@@ -195,6 +196,23 @@ fn a_replay_that_begins_anew_is_shown_from_its_beginning() {
     assert_eq!(shown(1, 2), [0; 0], "never back in time");
     assert_eq!(shown(2, 0), [0], "but another replay has a time of its own");
     assert_eq!(shown(2, 1), [1]);
+}
+
+#[test]
+fn ticks_without_a_result_count_as_unanswered_once_a_later_one_is_shown() {
+    let mut assembly = FrameAssembler::default();
+    let mut pace = Vec::new();
+    for tick in 0..6 {
+        let is_result = |topic: &Topic| matches!(topic, Topic::Stream { stream: Stream::Detections, .. });
+        for (topic, payload) in messages(tick, 100_000_000 * tick, Stream::Preview) {
+            let header = wire::decode_header([payload.as_slice()]).unwrap();
+            let seen = ReceivedMessage { topic: &topic, header: &header, arrived_nanos: 0, payload: Some(&payload) };
+            if !is_result(&topic) || tick % 2 == 1 {
+                pace.extend(assembly.add(&seen).map(|frame| (frame.pace.answered, frame.pace.ticks)));
+            }
+        }
+    }
+    assert_eq!(pace, [(1, 2), (2, 4), (3, 6)]);
 }
 
 /// A run that goes on at 10 Hz until dropped.

@@ -45,7 +45,7 @@ fn fuse(criterion: &mut Criterion) {
             let of = |first: i64, count: i64| ReceivedMaps::new(features.narrow(0, first, count), None);
             let newest = of(0, agents as i64);
             let kept: Vec<ReceivedMaps> = no_grad(|| {
-                let kept = |map| stage.kept(&of(map, 1), &of(map, 1).maps).expect("maps are maps");
+                let kept = |map| stage.kept(&of(map, 1), &of(map, 1)).expect("maps are maps");
                 (agents as i64..size[0]).map(kept).collect()
             });
             let align = || {

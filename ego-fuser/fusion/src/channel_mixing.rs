@@ -10,6 +10,9 @@ use protocol::Pose;
 use tch::nn::{self, Init};
 use tch::{Kind, TchError, Tensor};
 
+use crate::f64_tensor::{are_numbers, flat, with_order};
+use crate::warp::Order;
+
 /// Name of the parameter in weights files; absent in weights that were trained without it.
 pub(crate) const WEIGHT: &str = "steering.weight";
 /// 1, cos, sin, cos 2, sin 2 of the heading: directions rotate with the first pair, axes (which are the same from both
@@ -32,52 +35,56 @@ impl ChannelMixing {
     }
 
     /// Converts feature maps `[N, C, H, W]` to the axes of the ego; those at the identity pose, the ego's own, are
-    /// unchanged.
+    /// unchanged. Where no gradient flows, the result has the given memory order.
     ///
     /// # Errors
     /// [`TchError`] when the channels differ from its own, or there is not one pose per feature map.
-    pub(crate) fn turn(&self, features: &Tensor, ego_from_cav: &[Pose]) -> Result<Tensor, TchError> {
-        let mut turned = Vec::with_capacity(ego_from_cav.len());
-        for (index, pose) in ego_from_cav.iter().enumerate() {
-            let map = features.f_narrow(0, index as i64, 1)?;
-            turned.push(self.turn_one(&map, pose)?);
+    pub(crate) fn turn(&self, features: &Tensor, ego_from_cav: &[Pose], order: Order) -> Result<Tensor, TchError> {
+        let matrices = ego_from_cav.iter().map(|pose| match *pose == Pose::IDENTITY {
+            true => Ok(None),
+            false => self.matrix(pose).map(Some),
+        });
+        let matrices: Vec<Option<Tensor>> = matrices.collect::<Result<_, TchError>>()?;
+        let learns = matrices.iter().flatten().any(Tensor::requires_grad);
+        if learns || !are_numbers(features) {
+            let turned =
+                (0..).zip(&matrices).map(|(map, matrix)| turned(&features.f_narrow(0, map, 1)?, matrix.as_ref()));
+            return Tensor::f_cat(&turned.collect::<Result<Vec<_>, TchError>>()?, 0);
         }
-        Tensor::f_cat(&turned, 0)
+        let result = with_order(features, order)?;
+        for (map, matrix) in (0..).zip(&matrices) {
+            let (from, mut to) = (flat(&features.f_get(map)?)?, flat(&result.f_get(map)?)?);
+            match matrix {
+                Some(matrix) => drop(matrix.f_mm_out(&to, &from)?.f_relu_()?),
+                None if to.stride() == from.stride() => to.f_copy_(&from)?,
+                // Exact, and faster than the library's copy into another memory order.
+                None => drop(self.identity()?.f_mm_out(&to, &from)?),
+            }
+        }
+        Ok(result)
     }
 
-    /// The same for one feature map `[1, C, H, W]`.
-    ///
-    /// # Errors
-    /// [`TchError`] when the channels differ from its own.
-    fn turn_one(&self, map: &Tensor, ego_from_cav: &Pose) -> Result<Tensor, TchError> {
-        if *ego_from_cav == Pose::IDENTITY {
-            return Ok(map.shallow_clone());
-        }
-        let matrix = self.matrix(ego_from_cav)?;
-        let cells = map.f_permute([0, 2, 3, 1])?;
-        if cells.is_contiguous() {
-            let change = cells.f_linear(&matrix, None::<&Tensor>)?;
-            return (cells + change).f_relu()?.f_permute([0, 3, 1, 2]);
-        }
-        let change = map.f_conv2d(
-            &matrix.f_unsqueeze(-1)?.f_unsqueeze(-1)?,
-            None::<Tensor>,
-            [1, 1].as_slice(),
-            [0, 0].as_slice(),
-            [1, 1].as_slice(),
-            1,
-        )?;
-        (map + change).f_relu()
-    }
-
-    /// `[C, C]`: weight of each channel in the sum that is added to each channel.
+    /// `[C, C]`: the mixing of a neighbour's channels, the identity included.
     fn matrix(&self, ego_from_cav: &Pose) -> Result<Tensor, TchError> {
         let yaw_rad = ego_from_cav.yaw_rad();
         let ((sin, cos), (sin_2, cos_2)) = (yaw_rad.sin_cos(), (2.0 * yaw_rad).sin_cos());
         let basis = [1.0, cos, sin, cos_2, sin_2].map(|value| value as f32);
         let basis = Tensor::f_from_slice(&basis)?.f_view([BASIS, 1, 1])?.f_to_device(self.weight.device())?;
-        (&self.weight * basis).f_sum_dim_intlist([0i64].as_slice(), false, Kind::Float)
+        let change = (&self.weight * basis).f_sum_dim_intlist([0i64].as_slice(), false, Kind::Float)?;
+        Ok(self.identity()? + change)
     }
+
+    /// `[C, C]`.
+    fn identity(&self) -> Result<Tensor, TchError> {
+        Tensor::f_eye(self.weight.size3()?.1, (Kind::Float, self.weight.device()))
+    }
+}
+
+/// A map `[1, C, H, W]` with its channels mixed; unchanged without a `matrix`.
+fn turned(map: &Tensor, matrix: Option<&Tensor>) -> Result<Tensor, TchError> {
+    let Some(matrix) = matrix else { return Ok(map.shallow_clone()) };
+    let weight = matrix.f_to_kind(map.kind())?.f_unsqueeze(-1)?.f_unsqueeze(-1)?;
+    map.f_conv2d(&weight, None::<&Tensor>, [1, 1], [0, 0], [1, 1], 1)?.f_relu()
 }
 
 #[cfg(test)]
@@ -100,7 +107,7 @@ mod tests {
         let variables = VarStore::new(Device::Cpu);
         let mixing = ChannelMixing::new(&variables.root(), 4);
         let features = Tensor::rand([2, 4, 3, 5], FLOAT);
-        assert_eq!(mixing.turn(&features, &[Pose::IDENTITY, turned(1.0)]).unwrap(), features);
+        assert_eq!(mixing.turn(&features, &[Pose::IDENTITY, turned(1.0)], Order::Planes).unwrap(), features);
     }
 
     #[test]
@@ -111,7 +118,7 @@ mod tests {
         let mixing = ChannelMixing { weight };
         let features = Tensor::ones([3, 2, 1, 1], FLOAT);
         let poses = [Pose::IDENTITY, turned(FRAC_PI_2), turned(PI)];
-        let out = Vec::<f32>::try_from(mixing.turn(&features, &poses).unwrap().view(-1)).unwrap();
+        let out = Vec::<f32>::try_from(mixing.turn(&features, &poses, Order::Planes).unwrap().view(-1)).unwrap();
         let expected = [1.0, 1.0, 2.0, 1.0, 1.0, 1.0];
         assert!(out.iter().zip(expected).all(|(found, expected)| (found - expected).abs() < 1e-6), "{out:?}");
     }
@@ -121,14 +128,21 @@ mod tests {
         let weight = Tensor::rand([BASIS, 3, 3], FLOAT) - 0.5;
         let (mixing, planes) = (ChannelMixing { weight }, Tensor::rand([1, 3, 4, 5], FLOAT));
         let cells = planes.permute([0, 2, 3, 1]).contiguous().permute([0, 3, 1, 2]);
-        let [planes, cells] = [planes, cells].map(|maps| mixing.turn(&maps, &[turned(0.4)]).unwrap());
-        assert!(planes.allclose(&cells, 1e-6, 1e-6, false));
+        let poses = [turned(0.4)];
+        let expected = super::turned(&planes, Some(&mixing.matrix(&poses[0]).unwrap())).unwrap();
+        for (maps, order) in
+            [&planes, &cells].into_iter().flat_map(|maps| [Order::Planes, Order::Cells].map(|to| (maps, to)))
+        {
+            let found = mixing.turn(maps, &poses, order).unwrap();
+            assert!(found.allclose(&expected, 1e-5, 1e-6, false));
+            assert_eq!(found.permute([0, 2, 3, 1]).is_contiguous(), order == Order::Cells);
+        }
     }
 
     #[test]
     fn another_number_of_channels_is_refused() {
         let variables = VarStore::new(Device::Cpu);
         let mixing = ChannelMixing::new(&variables.root(), 4);
-        assert!(mixing.turn(&Tensor::ones([1, 3, 2, 2], FLOAT), &[turned(0.5)]).is_err());
+        assert!(mixing.turn(&Tensor::ones([1, 3, 2, 2], FLOAT), &[turned(0.5)], Order::Planes).is_err());
     }
 }

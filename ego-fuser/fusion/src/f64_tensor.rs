@@ -2,6 +2,8 @@
 
 use tch::{Device, Kind, TchError, Tensor, nn};
 
+use crate::warp::Order;
+
 /// Cells that are transposed together; their data fit into a core's L1 cache.
 pub(crate) const BLOCK: usize = 16;
 
@@ -52,6 +54,21 @@ pub(crate) fn pointwise(convolution: &nn::Conv2D, maps: &Tensor) -> Result<Tenso
         return maps.f_conv2d(weight, bias, [1, 1], [0, 0], [1, 1], 1);
     }
     cells.f_linear(&weight.f_flatten(1, 3)?, bias)?.f_permute([0, 3, 1, 2])
+}
+
+/// `[C, H * W]` of a map `[C, H, W]`, without a copy in either memory order.
+pub(crate) fn flat(map: &Tensor) -> Result<Tensor, TchError> {
+    map.f_flatten(1, 2)
+}
+
+/// Maps of the size of `maps` `[N, C, H, W]` in a memory order, not filled.
+pub(crate) fn with_order(maps: &Tensor, order: Order) -> Result<Tensor, TchError> {
+    let (count, channels, height, width) = maps.size4()?;
+    let options = (maps.kind(), maps.device());
+    match order {
+        Order::Planes => Tensor::f_empty([count, channels, height, width], options),
+        Order::Cells => Tensor::f_empty([count, height, width, channels], options)?.f_permute([0, 3, 1, 2]),
+    }
 }
 
 /// `[1, C, H, W]` of a map `[C, H, W]` in its memory order, such that convolutions use that order.

@@ -47,13 +47,17 @@ impl ReceivedMaps {
         Self { maps, sent, full_resolution: Vec::new() }
     }
 
-    /// The entries from `first` up to `end`, without their copies at full resolution.
+    /// The entries from `first` up to `end`.
     ///
     /// # Errors
     /// [`TchError`] when there are fewer.
     pub fn only(&self, first: i64, end: i64) -> Result<Self, TchError> {
         let of = |tensor: &Tensor| tensor.f_narrow(0, first, end - first);
-        Ok(Self::new(of(&self.maps)?, self.sent.as_ref().map(of).transpose()?))
+        let full_resolution = self.full_resolution.get(first as usize..end as usize).unwrap_or_default();
+        Ok(Self {
+            full_resolution: full_resolution.iter().map(FullResolutionMap::shallow_clone).collect(),
+            ..Self::new(of(&self.maps)?, self.sent.as_ref().map(of).transpose()?)
+        })
     }
 
     /// Maps of one size, one after another.

@@ -174,6 +174,8 @@ impl Node<'_> {
             self.bus.stats().timed(&stage.stage, Duration::from_nanos(stage.nanos));
         }
         self.report.frames += 1;
+        // The ego does not know when the sensors of its vehicle measured.
+        self.bus.stats().answered(None, result.fused.len());
         let (fused, binary) = (unix_nanos(), result.clone());
         self.detections.submit_encoded(capture_nanos, move |stamp| {
             let mut result = binary;

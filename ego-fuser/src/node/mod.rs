@@ -193,7 +193,7 @@ impl<'a> Node<'a> {
             pace: options.sets_pace.then(|| PaceKeeper::open(bus, cav)).transpose()?,
             own_nanos: None,
             ended: BTreeSet::new(),
-            detections: bus.publisher(topic(Stream::Detections), PublisherOptions::DETECTIONS.lossless(RESULTS))?,
+            detections: bus.publisher(topic(Stream::Detections), PublisherOptions::DETECTIONS.waiting(RESULTS))?,
             json: bus.publisher(topic(Stream::DetectionsJson), PublisherOptions::DETECTIONS)?,
             report: NodeReport::default(),
             _own: own,

@@ -15,7 +15,7 @@ use tracing_subscriber::{EnvFilter, Registry};
 
 use super::handshake_failures::HandshakeCounter;
 use super::shutdown::Stop;
-use super::{Bus, BusError, BusOptions, Credentials, Endpoint, Identity, InboxLimits, process_id};
+use super::{Bus, BusError, BusOptions, Credentials, Endpoint, Identity, InboxLimits, SharedMemory, process_id};
 
 /// Maximum duration of a shutdown after the request: within the 5 s of a whole fleet.
 pub const STOP_LIMIT: Duration = Duration::from_secs(4);
@@ -38,7 +38,8 @@ pub struct BusConfig {
     /// Maximum time of trying to reach the router, seconds.
     #[arg(long, value_name = "S")]
     pub connect_timeout_s: f64,
-    /// Shared memory for large messages between processes of one machine, MiB; 0: none, all messages use the socket.
+    /// Pool of shared memory for the large messages of this process to others of the same machine, MiB; 0: none, all
+    /// messages use the socket. The router has to be attached to shared memory.
     #[arg(long, value_name = "MIB")]
     pub shared_memory_mib: usize,
     /// Largest message accepted from outside, MiB.
@@ -89,12 +90,25 @@ impl BusConfig {
             None => BusOptions::client(self.connect.clone()),
         };
         options.connect_timeout = Duration::try_from_secs_f64(self.connect_timeout_s).unwrap_or(Duration::ZERO);
-        options.shared_memory_pool = Some(self.shared_memory_mib << 20).filter(|bytes| *bytes > 0);
+        options.shared_memory = self.shared_memory();
         options.max_message_bytes = self.max_message_mib << 20;
         Ok(match &self.keys {
             Some(folder) => options.with_credentials(Credentials::read(folder)?),
             None => options,
         })
+    }
+
+    /// Use of shared memory. It needs a router on this machine's loopback: to others zenoh hands large messages over in
+    /// a way that leaves shared memory out.
+    fn shared_memory(&self) -> SharedMemory {
+        match self.shared_memory_mib {
+            0 => SharedMemory::Off,
+            _ if !self.listen.as_ref().unwrap_or(&self.connect).is_loopback() => {
+                tracing::warn!("no shared memory: the router is not at an address of the loopback");
+                SharedMemory::Off
+            }
+            mib => SharedMemory::Pool(mib << 20),
+        }
     }
 
     /// Joins `run` in a role.

@@ -16,6 +16,7 @@ use super::liveliness::{LivelinessEvent, LivelinessSubscription, LivelinessToken
 use super::metrics::MetricsServer;
 use super::passive_subscriber::PassiveSubscriber;
 use super::publisher::{Publisher, PublisherOptions, unix_nanos};
+use super::shared_pool::SharedPool;
 use super::shutdown::{self, Overdue};
 use super::status_publisher::{StatusPublisher, StatusSender};
 use super::subscriber::{Inbox, Subscription};
@@ -39,6 +40,7 @@ pub struct Bus {
     identity: Identity,
     epoch: u64,
     stats: MessageStats,
+    pool: SharedPool,
     status: StatusPublisher,
     status_thread: JoinHandle<()>,
     metrics: Option<MetricsServer>,
@@ -50,10 +52,12 @@ impl Bus {
     /// # Errors
     /// [`BusError`], as [`open`].
     pub fn join(options: &BusOptions, identity: Identity) -> Result<Self, BusError> {
-        Self::over(open(options)?, identity)
+        let mut bus = Self::over(open(options)?, identity)?;
+        bus.pool = SharedPool::open(&bus.session, options.shared_memory.pool_bytes(), &bus.stats)?;
+        Ok(bus)
     }
 
-    /// Joins the run over a session that is open already.
+    /// Joins the run over a session that is open already, without a pool of shared memory.
     ///
     /// # Errors
     /// [`BusError::Thread`] when the system cannot start a thread.
@@ -66,7 +70,8 @@ impl Bus {
             epoch,
             stats: stats.clone(),
         })?;
-        Ok(Self { session, identity, epoch, stats, status, status_thread, metrics: None })
+        let pool = SharedPool::none();
+        Ok(Self { session, identity, epoch, stats, pool, status, status_thread, metrics: None })
     }
 
     /// Serves the counters to Prometheus until this is dropped; returns the address.
@@ -108,7 +113,7 @@ impl Bus {
             _ => self.identity.cav.clone(),
         };
         let key = topic.in_run(&self.identity.run);
-        Publisher::new(&self.session, (&key, &cav), self.epoch, &self.stats, options)
+        Publisher::new(&self.session, (&key, &cav), self.epoch, (&self.stats, &self.pool), options)
     }
 
     /// An inbox of `places` messages for each of at most `max_topics` topics.
@@ -201,7 +206,8 @@ impl Bus {
     /// # Errors
     /// [`Overdue`] when the session does not close in time; the end of the process closes it.
     pub fn leave(self, limit: Duration) -> Result<(), Overdue> {
-        let Self { session, identity, status, status_thread, .. } = self;
+        let Self { session, identity, status, status_thread, pool, .. } = self;
+        drop(pool);
         status.close();
         shutdown::within(limit, "the zenoh session", move || {
             if status_thread.join().is_err() {

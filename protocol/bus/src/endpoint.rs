@@ -1,6 +1,7 @@
 //! Endpoints of routers: `tcp/HOST:PORT` and `quic/HOST:PORT`.
 
 use std::fmt;
+use std::net::IpAddr;
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -52,6 +53,14 @@ impl Endpoint {
         Self(format!("tcp/127.0.0.1:{port}"))
     }
 
+    /// True if the address is one of the loopback.
+    #[must_use]
+    pub fn is_loopback(&self) -> bool {
+        let host = self.address().rsplit_once(':').map_or("", |(host, _)| host);
+        let ip = host.trim_start_matches('[').trim_end_matches(']').parse::<IpAddr>();
+        host == "localhost" || ip.is_ok_and(|ip| ip.is_loopback())
+    }
+
     /// The same address over QUIC with keys. A process with keys never falls back to plain TCP.
     #[must_use]
     pub fn secured(&self) -> Self {
@@ -99,6 +108,16 @@ impl std::str::FromStr for Endpoint {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn loopbacks_are_recognised() {
+        for text in ["tcp/127.0.0.1:1", "quic/127.1.2.3:1", "tcp/[::1]:1", "tcp/localhost:1"] {
+            assert!(Endpoint::new(text).unwrap().is_loopback(), "{text}");
+        }
+        for text in ["tcp/0.0.0.0:1", "tcp/10.0.0.1:1", "tcp/[::]:1", "tcp/router.local:1"] {
+            assert!(!Endpoint::new(text).unwrap().is_loopback(), "{text}");
+        }
+    }
 
     #[test]
     fn reads_endpoints() {

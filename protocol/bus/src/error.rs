@@ -58,6 +58,16 @@ pub enum BusError {
         /// Error of the system.
         cause: std::io::Error,
     },
+    /// The system has too little shared memory.
+    #[error(
+        "a pool of {wanted_mib} MiB of shared memory: {free_mib} MiB are free in /dev/shm; every process has a pool of its own"
+    )]
+    SharedMemory {
+        /// Size of the pool, MiB.
+        wanted_mib: usize,
+        /// Free memory, MiB.
+        free_mib: u64,
+    },
     /// The metrics cannot be served at the address.
     #[error("cannot serve metrics at {address}: {cause}")]
     Metrics {
@@ -88,7 +98,7 @@ impl BusError {
     /// True if the input is at fault, so that a retry has no effect.
     #[must_use]
     pub fn is_bad_input(&self) -> bool {
-        matches!(self, Self::Endpoint(_) | Self::Keys { .. } | Self::NoKeys(_))
+        matches!(self, Self::Endpoint(_) | Self::Keys { .. } | Self::NoKeys(_) | Self::SharedMemory { .. })
     }
 
     pub(super) fn zenoh(doing: impl Into<String>, cause: &zenoh::Error) -> Self {

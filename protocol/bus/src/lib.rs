@@ -4,6 +4,8 @@
 //! - No producer waits for the network and no callback of zenoh waits for a consumer: between them are bounded queues
 //!   that keep the newest message ([`bounded_queue`], [`Publisher`], [`Inbox`]).
 //! - Overwritten, rejected and in-flight messages are counted ([`MessageStats`]), and the ledger is published.
+//! - No receiver stops the messages of the others; what a router drops for one is counted there (`egress`,
+//!   `delivery_gaps`).
 //! - A scene starts when every route has carried a message ([`Barrier`]).
 //! - With keys every process is authenticated, and the router restricts it to its own topics ([`Credentials`],
 //!   [`AccessControl`]); rejected messages are counted ([`RejectionLog`]).
@@ -24,9 +26,12 @@ mod bus;
 mod clock_offset;
 pub mod config_file;
 mod credentials;
+mod delivery_gaps;
+mod egress;
 mod endpoint;
 mod error;
 mod flush_barrier;
+mod frame_stats;
 mod handshake_failures;
 mod inbox_limits;
 mod liveliness;
@@ -37,11 +42,13 @@ mod metrics;
 mod passive_subscriber;
 mod plain_tcp;
 mod process_config;
+mod process_usage;
 mod publisher;
 mod readiness;
 mod rejection_log;
 mod replay_window;
 mod session;
+mod shared_pool;
 pub mod shutdown;
 mod status_publisher;
 mod subscriber;
@@ -54,15 +61,17 @@ pub use bus::{Bus, Identity};
 pub use credentials::{AUTHORITY_FILE, CERTIFICATE_FILE, Credentials, KEY_FILE, MEMBERS_FILE, ROUTER};
 pub use endpoint::Endpoint;
 pub use error::BusError;
+pub use frame_stats::FrameStats;
 pub use inbox_limits::InboxLimits;
 pub use liveliness::{LivelinessEvent, LivelinessSubscription, LivelinessToken, present};
 pub use membership::Membership;
-pub use message_stats::{MessageStats, PeerSummary};
+pub use message_stats::{MessageStats, PeerSummary, SharedMemoryUse};
 pub use passive_subscriber::{PassiveSubscriber, RawMessage};
 pub use process_config::{Configured, ProcessConfig, minimal};
+pub use process_usage::{process_cpu_s, process_usage};
 pub use publisher::{Overflow, Publisher, PublisherOptions, unix_nanos};
 pub use readiness::{Barrier, NotReady, Route, RouteError, RoutesReady, process_id};
 pub use rejection_log::{Rejection, RejectionLog};
-pub use session::{BusOptions, open};
+pub use session::{BusOptions, Role as SessionRole, SharedMemory, open};
 pub use subscriber::{Arrival, Event, Inbox, Subscription};
 pub use watchdog::Heartbeat;

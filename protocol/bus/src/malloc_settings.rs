@@ -1,4 +1,4 @@
-//! Settings of the allocator and of libtorch that are environment variables and have to be set before a process starts.
+//! Settings of the allocator, of libtorch and of zenoh that are environment variables and have to be set before a process starts.
 
 use std::env;
 use std::io;
@@ -23,6 +23,14 @@ pub const KEPT_MEMORY: [Setting; 4] = [
 /// would grow by gigabytes of products that are never used again. The steps of a head, which all have the same shape,
 /// are not slower with it.
 pub const FEW_PRODUCTS: [Setting; 2] = [("LRU_CACHE_CAPACITY", "16"), ("ONEDNN_PRIMITIVE_CACHE_CAPACITY", "16")];
+
+/// Threads of a router. zenoh's two threads for incoming messages are not enough: one that closes the connection of a
+/// receiver that took nothing waits up to 10 s in the system (`SO_LINGER` on a socket with unsent data), and with two
+/// such receivers nobody's messages would move.
+pub const ROUTER_THREADS: Setting = (
+    "ZENOH_RUNTIME",
+    "(rx: (worker_threads: 16), tx: (worker_threads: 4), net: (worker_threads: 4), acc: (worker_threads: 4))",
+);
 
 /// Executes the process again with these settings, unless they are set already. To be called first of all.
 ///

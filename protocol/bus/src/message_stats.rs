@@ -5,11 +5,14 @@ use std::fmt;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use protocol::{Account, CavId, DropReason, Ledger, Limits, ProcessId, RateReason, StageSummary, Topic, WireError};
+use protocol::{
+    Account, CavId, DropReason, Ledger, Limits, ProcessId, RateReason, StageSummary, Topic, TopicTraffic, WireError,
+};
 
 use support::statistics::{quantile, sorted};
 
 use super::clock_offset::ClockOffset;
+use super::frame_stats::FrameStats;
 
 /// Maximum number of accounts of one process, equal to the limit of the ledger's receivers.
 const MAX_ACCOUNTS: usize = Limits::DEFAULT.max_entries;
@@ -26,6 +29,29 @@ pub struct MessageStats {
     state: Arc<Mutex<State>>,
 }
 
+/// Way of a large message of a process that has a pool of shared memory.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum SharedMemoryUse {
+    /// It was in shared memory.
+    Carried,
+    /// It took the socket: the pool had no room.
+    PoolFull,
+    /// It took the socket: the router is not attached to shared memory.
+    RouterNotAttached,
+}
+
+impl SharedMemoryUse {
+    /// Its name in metrics.
+    #[must_use]
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::Carried => "carried",
+            Self::PoolFull => "pool_full",
+            Self::RouterNotAttached => "router_not_attached",
+        }
+    }
+}
+
 #[derive(Default)]
 struct State {
     ledger: Ledger,
@@ -35,7 +61,11 @@ struct State {
     // Malformed messages, of any kind of topic.
     rejections: BTreeMap<Topic, u64>,
     stages: BTreeMap<String, Timings>,
+    // Published messages and their bytes.
+    traffic: BTreeMap<Topic, (u64, u64)>,
+    frames: FrameStats,
     peers: BTreeMap<CavId, Peer>,
+    shared: BTreeMap<SharedMemoryUse, u64>,
     is_full: bool,
 }
 
@@ -135,6 +165,33 @@ impl MessageStats {
         self.note(topic, |state| state.ledger.dropped(&self.here(topic), reason));
     }
 
+    /// Counts messages that the router has taken and not handed on to this process.
+    pub(super) fn undelivered(&self, topic: &Topic, messages: u32) {
+        self.note(topic, |state| {
+            state.pass_many(self.here(topic), u64::from(messages));
+            state.ledger.dropped_many(&self.here(topic), DropReason::Undelivered, u64::from(messages));
+        });
+    }
+
+    /// Counts a large message of a process with a pool of shared memory; the first on the socket is logged.
+    pub(super) fn shared(&self, way: SharedMemoryUse) {
+        let is_first = {
+            let mut state = self.lock();
+            let count = state.shared.entry(way).or_default();
+            *count += 1;
+            *count == 1
+        };
+        if is_first && way != SharedMemoryUse::Carried {
+            tracing::warn!(reason = way.as_str(), "a large message takes the socket instead of shared memory");
+        }
+    }
+
+    /// Large messages of a process with a pool of shared memory, by their way.
+    #[must_use]
+    pub fn shared_memory(&self) -> BTreeMap<SharedMemoryUse, u64> {
+        self.lock().shared.clone()
+    }
+
     /// Counts an arrived message as malformed; logged ever more rarely, as a hostile peer must not fill the log.
     pub fn rejected(&self, topic: &Topic, error: &WireError) {
         self.count_rejected(topic, error.drop_reason(), error);
@@ -224,6 +281,40 @@ impl MessageStats {
         timings.last.push_back(time);
     }
 
+    /// Counts the bytes of a message that the network has taken.
+    pub(super) fn published(&self, topic: &Topic, bytes: usize) {
+        let mut state = self.lock();
+        if state.traffic.len() < MAX_ACCOUNTS || state.traffic.contains_key(topic) {
+            let (messages, sum) = state.traffic.entry(topic.clone()).or_default();
+            (*messages, *sum) = (*messages + 1, sum.saturating_add(bytes as u64));
+        }
+    }
+
+    /// Published messages and bytes so far, by topic.
+    #[must_use]
+    pub fn traffic(&self) -> Vec<TopicTraffic> {
+        let of =
+            |(topic, &(messages, bytes)): (&Topic, &(u64, u64))| TopicTraffic { topic: topic.clone(), messages, bytes };
+        self.lock().traffic.iter().map(of).collect()
+    }
+
+    /// Counts a tick of the scene.
+    pub fn tick(&self) {
+        self.lock().frames.ticks += 1;
+    }
+
+    /// Counts the detections of a frame; `latency` is the time from the publication of the tick to that of its
+    /// detections, `None` if unknown here.
+    pub fn answered(&self, latency: Option<Duration>, fused_neighbours: usize) {
+        self.lock().frames.answer(latency, fused_neighbours);
+    }
+
+    /// Frames so far, from end to end.
+    #[must_use]
+    pub fn frames(&self) -> FrameStats {
+        self.lock().frames.clone()
+    }
+
     /// Current ledger. Messages submitted and not handed over, or arrived and not yet used or dropped, are in flight.
     #[must_use]
     pub fn ledger(&self) -> Ledger {
@@ -296,7 +387,11 @@ impl State {
     }
 
     fn pass(&mut self, account: Account) {
-        *self.passed.entry(account).or_default() += 1;
+        self.pass_many(account, 1);
+    }
+
+    fn pass_many(&mut self, account: Account, messages: u64) {
+        *self.passed.entry(account).or_default() += messages;
     }
 }
 

@@ -1,4 +1,4 @@
-//! Metrics endpoint: message counters and stage durations for Prometheus.
+//! Metrics endpoint: message counters, frames from end to end, stage durations and resources for Prometheus.
 
 use std::borrow::Cow;
 use std::fmt;
@@ -11,7 +11,7 @@ use prometheus_client::metrics::counter::ConstCounter;
 use prometheus_client::metrics::gauge::ConstGauge;
 use prometheus_client::registry::{Registry, Unit};
 
-use super::MessageStats;
+use super::{FrameStats, MessageStats, process_usage};
 use crate::web::{Answer, WebServer};
 
 /// Serves the counters of a process at `http://<address>/metrics` until dropped.
@@ -44,12 +44,66 @@ const CONTENT_TYPE: &str = "application/openmetrics-text; version=1.0.0; charset
 #[must_use]
 pub(crate) fn exposition(stats: &MessageStats) -> String {
     let process = (Cow::from("process"), Cow::from(stats.process().to_string()));
-    let mut registry = Registry::with_prefix_and_labels("v2vloc", [process].into_iter());
+    let mut registry = Registry::with_prefix_and_labels("v2vloc", [process.clone()].into_iter());
     registry.register_collector(Box::new(StatsCollector(stats.clone())));
+    // Named as by the client libraries of Prometheus, on which dashboards rely: without our prefix.
+    let mut system = Registry::with_labels([process].into_iter());
+    system.register_collector(Box::new(ProcessCollector));
     let mut text = String::new();
     // Writing to a string cannot fail.
-    let _ = text::encode(&mut text, &registry);
+    let _ = text::encode_registry(&mut text, &registry);
+    let _ = text::encode_registry(&mut text, &system);
+    let _ = text::encode_eof(&mut text);
     text
+}
+
+/// CPU time and memory of this process.
+#[derive(Debug)]
+struct ProcessCollector;
+
+impl Collector for ProcessCollector {
+    fn encode(&self, mut encoder: DescriptorEncoder) -> fmt::Result {
+        let usage = process_usage();
+        let (help, seconds) = ("User and system time of all threads", Some(&Unit::Seconds));
+        let cpu = encoder.encode_descriptor("process_cpu", help, seconds, MetricType::Counter)?;
+        ConstCounter::new(usage.cpu_s).encode(cpu)?;
+        let bytes = Some(&Unit::Bytes);
+        for (name, help, value) in [
+            ("process_resident_memory", "Resident memory", usage.resident_bytes),
+            ("process_peak_resident_memory", "Largest resident memory so far", usage.peak_resident_bytes),
+        ] {
+            let memory = encoder.encode_descriptor(name, help, bytes, MetricType::Gauge)?;
+            ConstGauge::new(i64::try_from(value).unwrap_or(i64::MAX)).encode(memory)?;
+        }
+        Ok(())
+    }
+}
+
+/// Encodes ticks, answers, fused neighbours and latency of a process that has frames.
+fn encode_frames(frames: &FrameStats, encoder: &mut DescriptorEncoder<'_>) -> fmt::Result {
+    if frames.ticks > 0 {
+        let ticks = encoder.encode_descriptor("ticks", "Ticks of the scene", None, MetricType::Counter)?;
+        ConstCounter::new(frames.ticks).encode(ticks)?;
+    }
+    if frames.ticks + frames.answered == 0 {
+        return Ok(());
+    }
+    let counters = [
+        ("answered_ticks", "Ticks with detections", frames.answered),
+        ("fused_neighbours", "Neighbours whose data were fused, over all frames", frames.fused_neighbours),
+    ];
+    for (name, help, value) in counters {
+        let counter = encoder.encode_descriptor(name, help, None, MetricType::Counter)?;
+        ConstCounter::new(value).encode(counter)?;
+    }
+    if frames.latencies == 0 {
+        return Ok(());
+    }
+    let help = "From the publication of a tick to that of its detections";
+    let mut latency =
+        encoder.encode_descriptor("capture_to_detection", help, Some(&Unit::Seconds), MetricType::Histogram)?;
+    let buckets = frames.latency_buckets();
+    latency.encode_histogram::<[(&str, &str); 0]>(frames.latency_sum_s, frames.latencies, &buckets, None)
 }
 
 struct StatsCollector(MessageStats);
@@ -93,6 +147,22 @@ impl Collector for StatsCollector {
             let labels = [("topic", topic.as_str()), ("side", side)];
             ConstGauge::new(count).encode(in_flight.encode_family(&labels)?)?;
         }
+        let mut shared = encoder.encode_descriptor(
+            "shared_memory_messages",
+            "Large messages of a process with a pool of shared memory, by their way",
+            None,
+            MetricType::Counter,
+        )?;
+        for (way, count) in self.0.shared_memory() {
+            ConstCounter::new(count).encode(shared.encode_family(&[("way", way.as_str())])?)?;
+        }
+        let help = "Bytes of published messages, each counted once for all its receivers";
+        let mut bytes = encoder.encode_descriptor("published", help, Some(&Unit::Bytes), MetricType::Counter)?;
+        for traffic in self.0.traffic() {
+            let topic = traffic.topic.to_string();
+            ConstCounter::new(traffic.bytes).encode(bytes.encode_family(&[("topic", topic.as_str())])?)?;
+        }
+        encode_frames(&self.0.frames(), &mut encoder)?;
         let seconds = Unit::Seconds;
         let peers = self.0.peers();
         let mut clocks = encoder.encode_descriptor(
@@ -145,6 +215,11 @@ mod tests {
         stats.dropped(&lidar, DropReason::Superseded);
         stats.submitted(&bev);
         stats.trusted(&cav, 0.25);
+        stats.published(&bev, 1_500);
+        stats.published(&bev, 500);
+        (0..3).for_each(|_| stats.tick());
+        stats.answered(Some(Duration::from_millis(110)), 2);
+        stats.answered(None, 1);
         for milliseconds in [0.2, 3.0, 4.0, 40.0, 9_000.0] {
             stats.timed("encode \"x\"", Duration::from_secs_f64(milliseconds / 1e3));
         }
@@ -163,13 +238,30 @@ mod tests {
             ),
             format!("v2vloc_messages_in_flight{{{process},topic=\"4279/lidar\",side=\"receiver\"}} 2"),
             format!("v2vloc_trust{{{process},vehicle=\"4279\"}} 0.25"),
+            format!("v2vloc_published_bytes_total{{{process},topic=\"4279/bev\"}} 2000"),
+            format!("v2vloc_ticks_total{{{process}}} 3"),
+            format!("v2vloc_answered_ticks_total{{{process}}} 2"),
+            format!("v2vloc_fused_neighbours_total{{{process}}} 3"),
+            format!("v2vloc_capture_to_detection_seconds_bucket{{le=\"0.1\",{process}}} 0"),
+            format!("v2vloc_capture_to_detection_seconds_bucket{{le=\"0.12\",{process}}} 1"),
+            format!("v2vloc_capture_to_detection_seconds_sum{{{process}}} 0.11"),
+            "# TYPE process_cpu_seconds counter".into(),
+            "# TYPE process_resident_memory_bytes gauge".into(),
             "# TYPE v2vloc_stage_seconds histogram".into(),
             "# EOF".into(),
         ] {
             assert!(text.lines().any(|found| found == line), "{line}\nis not in\n{text}");
         }
+        for name in ["process_cpu_seconds_total", "process_resident_memory_bytes"] {
+            let line = text.lines().find(|line| line.starts_with(&format!("{name}{{{process}}}")));
+            let value = line.and_then(|line| line.rsplit(' ').next()).and_then(|value| value.parse::<f64>().ok());
+            assert!(value.is_some_and(|value| value > 0.0), "{name} in\n{text}");
+        }
+        assert_eq!(text.matches("# EOF").count(), 1);
         let bucket = |le: &str| {
-            let line = text.lines().find(|line| line.contains("_bucket") && line.contains(&format!("le=\"{le}\"")));
+            let line = text
+                .lines()
+                .find(|line| line.contains("stage_seconds_bucket") && line.contains(&format!("le=\"{le}\"")));
             line.and_then(|line| line.rsplit(' ').next()).and_then(|count| count.parse::<u64>().ok())
         };
         assert_eq!(
@@ -183,7 +275,8 @@ mod tests {
         let server = MetricsServer::start("127.0.0.1:0".parse().unwrap(), &sample()).unwrap();
         let (status, body) = crate::web::fetch(server.address(), "/metrics").unwrap();
         assert_eq!(status, "HTTP/1.0 200 OK");
-        assert_eq!(String::from_utf8(body).unwrap(), exposition(&sample()));
+        let text = String::from_utf8(body).unwrap();
+        assert!(text.contains("v2vloc_ticks_total") && text.ends_with("# EOF\n"), "{text}");
         assert!(crate::web::fetch(server.address(), "/").unwrap().0.contains("404"));
     }
 }

@@ -3,8 +3,8 @@
 //! Captured messages are outside the message accounting, so that a passive subscriber may join late, leave early and
 //! overwrite messages without loss in the ledgers; it counts overwritten messages itself.
 
-use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Instant;
 
 use protocol::{Control, Key, KeyExpr, Kind, Limits, Stream, Topic, wire};
@@ -13,6 +13,7 @@ use zenoh::bytes::ZBytes;
 use zenoh::sample::Sample;
 
 use super::bounded_queue::{BoundedQueue, Pop, PushOutcome};
+use super::delivery_gaps::DeliveryGaps;
 use super::status_publisher::StatusPublisher;
 use super::subscriber::has_notifications;
 use super::{BusError, unix_nanos};
@@ -68,6 +69,8 @@ struct Shared {
     queue: BoundedQueue<Topic, RawMessage>,
     waiting_bytes: AtomicUsize,
     overwritten: AtomicU64,
+    gaps: Mutex<DeliveryGaps>,
+    undelivered: AtomicU64,
 }
 
 impl PassiveSubscriber {
@@ -83,6 +86,8 @@ impl PassiveSubscriber {
             queue: BoundedQueue::new(places, MAX_TOPICS),
             waiting_bytes: AtomicUsize::new(0),
             overwritten: AtomicU64::new(0),
+            gaps: Mutex::default(),
+            undelivered: AtomicU64::new(0),
         });
         let subscribe = |selector: &KeyExpr| {
             let (shared, status) = (Arc::clone(&shared), status.clone());
@@ -109,6 +114,12 @@ impl PassiveSubscriber {
         self.shared.overwritten.load(Ordering::Relaxed)
     }
 
+    /// Number of messages that the router has not handed on, because this subscriber took earlier ones too slowly.
+    #[must_use]
+    pub fn undelivered(&self) -> u64 {
+        self.shared.undelivered.load(Ordering::Relaxed)
+    }
+
     /// A function that stops capturing; queued messages can still be taken.
     pub fn closer(&self) -> impl FnOnce() + Send + 'static {
         let shared = Arc::clone(&self.shared);
@@ -121,8 +132,14 @@ impl Shared {
     fn admit(&self, sample: &Sample, status: &StatusPublisher) {
         let Ok(key) = sample.key_expr().as_str().parse::<Key>() else { return };
         if has_notifications(&key.topic) && !is_json(&key.topic) {
-            match wire::decode_header(sample.payload().slices()) {
-                Ok(header) if header.kind == Kind::Control => return note(&key.topic, sample, status),
+            let header = wire::decode_header(sample.payload().slices());
+            let is_notice = header.as_ref().is_ok_and(|header| header.kind == Kind::Control);
+            let mut gaps = self.gaps.lock().unwrap_or_else(PoisonError::into_inner);
+            let skipped = gaps.note(&key.topic, sample.source_info(), is_notice);
+            drop(gaps);
+            self.undelivered.fetch_add(u64::from(skipped), Ordering::Relaxed);
+            match header {
+                Ok(_) if is_notice => return note(&key.topic, sample, status),
                 Ok(_) => status.confirm_route(&key.topic),
                 // Not counted here: the receiver of the message counts it.
                 Err(_) => {}
@@ -169,6 +186,8 @@ mod tests {
             queue: BoundedQueue::new(places, MAX_TOPICS),
             waiting_bytes: AtomicUsize::new(0),
             overwritten: AtomicU64::new(0),
+            gaps: Mutex::default(),
+            undelivered: AtomicU64::new(0),
         };
         PassiveSubscriber { shared: Arc::new(shared), _subscribers: Vec::new() }
     }

@@ -10,10 +10,12 @@ use protocol::{CavId, Control, DropReason, HEADER_LEN, Key, Payload, Stamp, Topi
 use zenoh::Wait;
 use zenoh::bytes::{Encoding, ZBytes};
 use zenoh::qos::{CongestionControl, Priority};
+use zenoh::sample::SourceInfo;
 
 use super::bounded_queue::{BoundedQueue, Pop, PushOutcome};
 use super::flush_barrier::FlushBarrier;
 use super::session::LONGEST_MESSAGE;
+use super::shared_pool::SharedPool;
 use super::{Arrival, BusError, MessageStats};
 use crate::batch_scheduling;
 use support::nanos;
@@ -50,14 +52,16 @@ pub struct PublisherOptions {
 }
 
 impl PublisherOptions {
-    /// Poses: small, highest priority.
+    /// Poses, estimated and of GNSS: small, highest priority.
     pub const POSE: Self = Self::new(Priority::InteractiveHigh, true);
-    /// Detections: small, before all bulk data.
+    /// Detections and truth: small, before all bulk data.
     pub const DETECTIONS: Self = Self::new(Priority::DataHigh, true);
     /// Features, boxes and points from an agent to an ego.
     pub const FEATURES: Self = Self::new(Priority::Data, false);
-    /// Sensor data to an agent.
+    /// Sweeps to an agent.
     pub const SENSOR: Self = Self::new(Priority::DataLow, false);
+    /// Radar points to an agent: some kilobytes.
+    pub const RADAR: Self = Self::new(Priority::InteractiveLow, false);
 
     /// Previews for people, not used in any computation.
     pub const PREVIEW: Self = Self { is_for_onlookers: true, ..Self::new(Priority::Background, false) };
@@ -66,14 +70,21 @@ impl PublisherOptions {
         Self { overflow: Overflow::KeepLast(1), priority, express, is_for_onlookers: false }
     }
 
-    /// The same, but the producer waits and no message is dropped.
+    /// The same, but the producer waits for a place among `places` instead of replacing a message.
+    #[must_use]
+    pub const fn waiting(self, places: usize) -> Self {
+        Self { overflow: Overflow::Wait(places), ..self }
+    }
+
+    /// The same, and the router waits for every receiver: no message is dropped, and a receiver that takes nothing
+    /// stops the publisher until its connection is closed. For paced runs.
     #[must_use]
     pub const fn lossless(self, places: usize) -> Self {
-        Self { overflow: Overflow::Wait(places), ..self }
+        Self { priority: Priority::RealTime, ..self.waiting(places) }
     }
 }
 
-type Encode = Box<dyn FnOnce(&Stamp) -> Result<ZBytes, WireError> + Send>;
+type Encode = Box<dyn FnOnce(&Stamp, &SharedPool) -> Result<ZBytes, WireError> + Send>;
 
 struct Submission {
     capture_nanos: u64,
@@ -83,7 +94,8 @@ struct Submission {
 /// Publisher of one topic of this process. A thread of its own encodes and sends submitted messages.
 ///
 /// `put` is called with `CongestionControl::Block`, so that zenoh never drops: by default it loses, without an error,
-/// every message that takes longer than 50 ms. As a consequence `put` waits for the network, for seconds on a slow one,
+/// every message that takes longer than 50 ms. A router hands over differently ([`crate`]'s `egress`); each message has
+/// a number by which receivers count what it has dropped for them. As a consequence `put` waits for the network, for seconds on a slow one,
 /// so neither a clock nor a network thread nor an async task may call it.
 ///
 /// With [`Overflow::KeepLast`] the next large message is taken only when the router has the previous one: `put`
@@ -104,7 +116,7 @@ impl Publisher {
         session: &zenoh::Session,
         (key, cav): (&Key, &CavId),
         epoch: u64,
-        stats: &MessageStats,
+        (stats, pool): (&MessageStats, &SharedPool),
         options: PublisherOptions,
     ) -> Result<Self, BusError> {
         let PublisherOptions { overflow, priority, express, is_for_onlookers } = options;
@@ -136,6 +148,8 @@ impl Publisher {
             has_notifications: !is_json && !is_for_onlookers,
             queue: Arc::clone(&queue),
             stats: stats.clone(),
+            pool: pool.clone(),
+            handed_over: 0,
             publisher,
             receipt: FlushBarrier::new(session, &key.run, priority),
             is_one_at_a_time: matches!(overflow, Overflow::KeepLast(_)) && !is_for_onlookers,
@@ -171,13 +185,13 @@ impl Publisher {
         capture_nanos: u64,
         encode: impl FnOnce(&Stamp) -> Result<Encoded, WireError> + Send + 'static,
     ) {
-        self.push(Submission { capture_nanos, encode: Box::new(|stamp| encode(stamp).map(payload)) });
+        self.push(Submission { capture_nanos, encode: Box::new(|stamp, pool| Ok(pool.payload(encode(stamp)?))) });
     }
 
     /// Forwards a message unchanged, under the stamp of its sender; nothing is copied.
     pub fn relay(&self, arrival: &Arrival) {
         let bytes = arrival.payload().clone();
-        self.push(Submission { capture_nanos: arrival.header.stamp.capture_nanos, encode: Box::new(|_| Ok(bytes)) });
+        self.push(Submission { capture_nanos: arrival.header.stamp.capture_nanos, encode: Box::new(|_, _| Ok(bytes)) });
     }
 
     /// The same with another capture time, that of an erroneous clock.
@@ -192,7 +206,7 @@ impl Publisher {
         writer.append(header.to_bytes().to_vec().into());
         writer.append(rest.into());
         let bytes = writer.finish();
-        self.push(Submission { capture_nanos, encode: Box::new(|_| Ok(bytes)) });
+        self.push(Submission { capture_nanos, encode: Box::new(|_, _| Ok(bytes)) });
     }
 
     fn push(&self, submission: Submission) {
@@ -236,6 +250,9 @@ struct Sender {
     has_notifications: bool,
     queue: Arc<BoundedQueue<(), Submission>>,
     stats: MessageStats,
+    pool: SharedPool,
+    /// Messages that zenoh has taken, without notifications.
+    handed_over: u32,
     publisher: zenoh::pubsub::Publisher<'static>,
     receipt: FlushBarrier,
     /// True if the router must have a large message before the next one is taken from the queue.
@@ -264,13 +281,16 @@ impl Sender {
 
     fn send(&mut self, Submission { capture_nanos, encode }: Submission) {
         let began = Instant::now();
-        match encode(&self.stamp(capture_nanos)) {
+        match encode(&self.stamp(capture_nanos), &self.pool) {
             Ok(bytes) => {
                 self.stats.timed("encode", began.elapsed());
                 self.sequence += 1;
-                let is_large = bytes.len() >= SMALL_BYTES;
+                let length = bytes.len();
+                let is_large = length >= SMALL_BYTES;
                 if self.put(bytes) {
+                    self.handed_over = self.handed_over.wrapping_add(1);
                     self.stats.delivered(&self.topic);
+                    self.stats.published(&self.topic, length);
                     if is_large && self.is_one_at_a_time {
                         self.receipt.wait(LONGEST_MESSAGE);
                     }
@@ -297,7 +317,8 @@ impl Sender {
     }
 
     fn put(&self, bytes: ZBytes) -> bool {
-        let sent = self.publisher.put(bytes).wait();
+        let number = SourceInfo::new(self.publisher.id(), self.handed_over);
+        let sent = self.publisher.put(bytes).source_info(number).wait();
         if let Err(cause) = &sent {
             tracing::error!(topic = %self.topic, "zenoh rejected a message: {cause}");
         }
@@ -356,7 +377,8 @@ mod tests {
         let session = open(&BusOptions::router(Endpoint::loopback(0))).unwrap();
         let (key, stats): (Key, _) = ("v2v/test/7/gnss".parse().unwrap(), MessageStats::new("replay".parse().unwrap()));
         let cav = CavId::new("7").unwrap();
-        let publisher = Publisher::new(&session, (&key, &cav), 1, &stats, PublisherOptions::POSE).unwrap();
+        let publisher =
+            Publisher::new(&session, (&key, &cav), 1, (&stats, &SharedPool::none()), PublisherOptions::POSE).unwrap();
         session.close().wait().unwrap();
         let source = GnssSource::Recorded;
         let gnss = Gnss { world_from_lidar: Pose::IDENTITY, position_std_m: 0.0, heading_std_rad: 0.0, source };

@@ -8,6 +8,7 @@ use zenoh::{Config, Session, Wait};
 
 use super::access_control::{self, AccessControl};
 use super::credentials::{AUTHORITY_FILE, CERTIFICATE_FILE, Credentials, KEY_FILE};
+use super::egress;
 use super::endpoint::Endpoint;
 use super::error::BusError;
 
@@ -31,7 +32,7 @@ pub(super) const LONGEST_MESSAGE: Duration = Duration::from_secs(120);
 /// The same over QUIC: there a client is not notified that its router was killed, and a message in transit keeps zenoh
 /// from reconnecting until this timeout. 8 MiB at 2.3 Mbit/s.
 const LONGEST_SECURED: Duration = Duration::from_secs(30);
-/// The same for a router, where other messages of the same sender wait meanwhile.
+/// The same for a router, for one large message to one receiver on another host.
 const LONGEST_DELIVERY: Duration = Duration::from_secs(5);
 
 /// Role of a process in the star topology.
@@ -49,6 +50,28 @@ pub enum Role {
     },
 }
 
+/// Use of shared memory for the large messages of one machine. Without it they take the socket.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum SharedMemory {
+    /// Not used: messages of others that are in shared memory arrive over the socket.
+    Off,
+    /// Messages of others are received and routed there; own messages take the socket.
+    Attached,
+    /// As [`Self::Attached`], with a pool of so many bytes for own messages: at least three times those in flight.
+    Pool(usize),
+}
+
+impl SharedMemory {
+    /// Bytes of the pool; 0: none.
+    #[must_use]
+    pub fn pool_bytes(self) -> usize {
+        match self {
+            Self::Pool(bytes) => bytes,
+            Self::Off | Self::Attached => 0,
+        }
+    }
+}
+
 /// Options of a session.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct BusOptions {
@@ -56,13 +79,12 @@ pub struct BusOptions {
     pub role: Role,
     /// Timeout of a client for reaching the router.
     pub connect_timeout: Duration,
-    /// Bytes of shared memory for large messages on one machine; `None` keeps all messages on the socket, which
-    /// experiments with an emulated link need. At least three times the bytes of all feature maps in flight at once.
-    pub shared_memory_pool: Option<usize>,
+    /// Shared memory for large messages between processes of one machine.
+    pub shared_memory: SharedMemory,
     /// Maximum size of a message from outside, bytes; larger ones close their connection.
     pub max_message_bytes: usize,
-    /// Timeout for handing over one message, after which the connection is closed. Meanwhile a router delivers no other
-    /// messages of the same sender, so this bounds the delay that one stalled receiver causes for the others.
+    /// Timeout for handing over one message, after which the connection is closed. For a router: one large message to
+    /// one receiver on another host, or a message for which its publisher waits ([`super::PublisherOptions::lossless`]).
     pub stall_limit: Duration,
     /// Keys: all traffic uses QUIC, and both ends present certificates of the same authority.
     pub credentials: Option<Credentials>,
@@ -87,7 +109,7 @@ impl BusOptions {
         Self {
             role,
             connect_timeout: Duration::from_secs(10),
-            shared_memory_pool: None,
+            shared_memory: SharedMemory::Off,
             // Twice a full feature map of OpenCOOD's size (256 x 48 x 176 cells of f32 at stride 4 are 8.7 MB) and
             // every cloud.
             max_message_bytes: 32 << 20,
@@ -173,6 +195,7 @@ impl BusOptions {
             // KiB, which costs a fifth of the time of 8 MiB.
             ("transport/link/tx/queue/size/data", json!(TENSOR_BATCHES)),
             ("transport/link/tx/queue/size/data_low", json!(TENSOR_BATCHES)),
+            ("transport/link/tx/queue/size/real_time", json!(TENSOR_BATCHES)),
             ("transport/link/rx/max_message_size", json!(self.max_message_bytes)),
             ("transport/link/protocols", json!([if self.credentials.is_some() { "quic" } else { "tcp" }])),
             ("transport/unicast/max_sessions", json!(MAX_SESSIONS)),
@@ -182,15 +205,13 @@ impl BusOptions {
                 "transport/link/tx/queue/congestion_control/block/wait_before_close",
                 json!(u64::try_from(self.stall_limit.as_micros()).unwrap_or(u64::MAX)),
             ),
-            ("transport/shared_memory/enabled", json!(self.shared_memory_pool.is_some())),
-            ("transport/shared_memory/transport_optimization/enabled", json!(self.shared_memory_pool.is_some())),
-            (
-                "transport/shared_memory/transport_optimization/pool_size",
-                json!(self.shared_memory_pool.unwrap_or(16 << 20)),
-            ),
+            ("transport/shared_memory/enabled", json!(self.shared_memory != SharedMemory::Off)),
+            // Publishers put their messages there themselves, and count those for which there is no room.
+            ("transport/shared_memory/transport_optimization/enabled", json!(false)),
         ];
         if matches!(self.role, Role::Router { .. }) {
             settings.push(("low_pass_filter", access_control::size_limits()));
+            settings.extend(egress::settings());
         }
         settings.extend(self.credentials.iter().flat_map(tls_settings));
         if let Some(guard) = &self.guard {
@@ -293,7 +314,7 @@ mod tests {
     fn every_setting_reads_back() {
         let mut options = BusOptions::client(Endpoint::loopback(7447));
         config(&options).unwrap();
-        options.shared_memory_pool = Some(64 << 20);
+        options.shared_memory = SharedMemory::Pool(64 << 20);
         config(&options).unwrap();
         config(&BusOptions::router(Endpoint::loopback(7447))).unwrap();
     }

@@ -13,6 +13,7 @@ use zenoh::qos::{CongestionControl, Priority};
 use zenoh::{Session, Wait};
 
 use super::bounded_queue::{BoundedQueue, Pop, PushOutcome};
+use super::process_usage::process_usage;
 use super::publisher::{payload, unix_nanos};
 use super::watchdog::Watchdog;
 use super::{BusError, MessageStats};
@@ -158,7 +159,13 @@ impl StatusSender {
     fn stats(&self, sequence: &mut u64) {
         let process = self.stats.process().clone();
         let key = Key::stats(&self.run, &process);
-        let stats = Stats { process, ledger: self.stats.ledger(), stages: self.stats.stages() };
+        let stats = Stats {
+            process,
+            ledger: self.stats.ledger(),
+            stages: self.stats.stages(),
+            usage: process_usage(),
+            traffic: self.stats.traffic(),
+        };
         self.put(&key, Priority::Background, 0, stats, sequence);
     }
 

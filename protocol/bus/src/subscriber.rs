@@ -7,15 +7,19 @@ use std::time::Instant;
 use protocol::{Control, DropReason, Header, Key, KeyExpr, Kind, Limits, Payload, Stream, Topic, WireError, wire};
 use zenoh::Wait;
 use zenoh::bytes::ZBytes;
-use zenoh::sample::Sample;
+use zenoh::sample::{Sample, SourceInfo};
 
 use super::bounded_queue::{BoundedQueue, Pop, PushOutcome};
+use super::delivery_gaps::DeliveryGaps;
 use super::inbox_limits::{InboxLimits, RateLimiter};
 use super::publisher::unix_nanos;
 use super::replay_window::{Admission, ReplayWindow};
 use super::status_publisher::StatusPublisher;
 use super::watchdog::Watchdog;
 use super::{BusError, MessageStats};
+
+/// Maximum size of a notification. Larger messages are not read to find out whether they are one.
+const MAX_NOTICE_BYTES: usize = 16 << 10;
 
 /// Key of a queue lane: data and notifications of one topic are separate, so that a notification never replaces data.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
@@ -86,6 +90,7 @@ impl Arrival {
 pub struct Inbox {
     queue: BoundedQueue<Lane, Event>,
     replay_window: Mutex<ReplayWindow>,
+    gaps: Mutex<DeliveryGaps>,
     stats: MessageStats,
     meters: RateLimiter,
     max_waiting: usize,
@@ -103,6 +108,7 @@ impl Inbox {
             // Two lanes per topic: data and notifications.
             queue: BoundedQueue::new(places, max_topics.saturating_mul(2)),
             replay_window: Mutex::default(),
+            gaps: Mutex::default(),
             stats: stats.clone(),
             meters: RateLimiter::new(limits),
             max_waiting: limits.waiting_bytes,
@@ -211,7 +217,7 @@ impl Subscription {
     ) -> Result<Self, BusError> {
         let subscriber = session.declare_subscriber(key).callback(move |sample| {
             if let Some(topic) = topic(&sample) {
-                filter.admit(topic, sample.payload());
+                filter.admit(topic, sample.payload(), sample.source_info());
             }
         });
         subscriber.wait().map(Self).map_err(|cause| BusError::zenoh(format!("subscribing to {key}"), &cause))
@@ -240,8 +246,9 @@ impl IngressFilter {
         Self { inbox: Arc::clone(inbox), places, status: status.clone() }
     }
 
-    fn admit(&self, topic: Topic, payload: &ZBytes) {
-        // Before anything is read: a flood must cost next to nothing.
+    fn admit(&self, topic: Topic, payload: &ZBytes, source: Option<&SourceInfo>) {
+        self.count_gap(&topic, payload, source);
+        // Before the message is read: a flood must cost next to nothing.
         if !self.inbox.meters.admit(&topic, payload.len(), Instant::now()) {
             return self.reject(&topic, payload);
         }
@@ -262,6 +269,20 @@ impl IngressFilter {
         }
         let arrival = Arrival { topic: topic.clone(), header, at, payload: payload.clone() };
         self.inbox.deliver(&topic, Event::Message(arrival), self.places);
+    }
+
+    /// Counts the messages that the router has dropped before this one.
+    fn count_gap(&self, topic: &Topic, payload: &ZBytes, source: Option<&SourceInfo>) {
+        if !has_notifications(topic) || source.is_none() {
+            return;
+        }
+        let is_notice = payload.len() <= MAX_NOTICE_BYTES
+            && header_of(topic, payload).is_ok_and(|header| is_notice(topic, &header));
+        let mut gaps = self.inbox.gaps.lock().unwrap_or_else(PoisonError::into_inner);
+        let skipped = gaps.note(topic, source, is_notice);
+        if skipped > 0 {
+            self.inbox.stats.undelivered(topic, skipped);
+        }
     }
 
     /// Rejects a message above the rate limit. Its header decides whether the sender has counted it.
@@ -369,11 +390,11 @@ mod tests {
         let counts = || stats.ledger().get(&Account::towards(topic.clone(), stats.process())).cloned();
         stats.subscribed(&topic);
         for _ in 0..3 {
-            filter.admit(topic.clone(), &bytes(0, Control::Probe));
-            filter.admit(topic.clone(), &bytes(0, Control::End { ticks: 0, sent: Vec::new() }));
+            filter.admit(topic.clone(), &bytes(0, Control::Probe), None);
+            filter.admit(topic.clone(), &bytes(0, Control::End { ticks: 0, sent: Vec::new() }), None);
         }
         assert_eq!(counts(), Some(Counts::default()));
-        filter.admit(topic.clone(), &bytes(0, gnss()));
+        filter.admit(topic.clone(), &bytes(0, gnss()), None);
         assert_eq!(counts(), Some(Counts { dropped: [(DropReason::RateLimit, 1)].into(), ..Counts::default() }));
     }
 }

@@ -35,7 +35,7 @@ pub use ego_motion::EgoMotion;
 pub use gnss::{Gnss, GnssSource};
 pub use pace::Pace;
 pub use pose_estimate::{NoPoseReason, PlanarCovariance, PoseEstimate};
-pub use stats::{StageSummary, StageTiming, Stats};
+pub use stats::{ProcessUsage, StageSummary, StageTiming, Stats, TopicTraffic};
 pub use sweep::{Lidar, Points, PointsMetadata, Radar, SweepMetadata};
 pub use table::{Kind, Message};
 pub(crate) use table::{MessageSource, MessageVisitor};

@@ -1,4 +1,4 @@
-//! Statistics of a process: ledger and durations of stages.
+//! Statistics of a process: ledger, durations of stages, CPU time, memory and published bytes.
 
 use serde::{Deserialize, Serialize};
 
@@ -6,9 +6,13 @@ use super::{check_count, check_name, check_nanos, check_within, metadata_only};
 use crate::Ledger;
 use crate::Limits;
 use crate::ProcessId;
+use crate::Topic;
 use crate::WireError;
 
-/// Ledger and stage durations of a process: any process to the operator, regularly and at the end.
+/// Largest CPU time of a process that a receiver accepts, seconds: a thousand cores for a year.
+const MAX_CPU_S: f64 = 3.2e10;
+
+/// Ledger, stage durations and resources of a process: any process to the operator, regularly and at the end.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Stats {
     /// Process of these statistics.
@@ -17,6 +21,32 @@ pub struct Stats {
     pub ledger: Ledger,
     /// Durations of its stages.
     pub stages: Vec<StageSummary>,
+    /// CPU time and memory since the process started.
+    pub usage: ProcessUsage,
+    /// Published bytes, by topic.
+    pub traffic: Vec<TopicTraffic>,
+}
+
+/// CPU time and memory of a process, 0 where the system does not tell.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+pub struct ProcessUsage {
+    /// User and system time of all its threads, seconds.
+    pub cpu_s: f64,
+    /// Resident memory, bytes.
+    pub resident_bytes: u64,
+    /// Largest resident memory so far, bytes.
+    pub peak_resident_bytes: u64,
+}
+
+/// Messages that a process has published on one topic, each counted once for all its receivers.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct TopicTraffic {
+    /// The topic.
+    pub topic: Topic,
+    /// Number of messages.
+    pub messages: u64,
+    /// Bytes of header, metadata and body of these.
+    pub bytes: u64,
 }
 
 /// Duration of one stage for one frame.
@@ -65,6 +95,8 @@ impl Stats {
     fn check_values(&self, limits: &Limits) -> Result<(), WireError> {
         check_count("accounts", self.ledger.len(), limits.max_entries)?;
         check_count("stages", self.stages.len(), limits.max_entries)?;
+        check_count("topics", self.traffic.len(), limits.max_entries)?;
+        check_within("cpu_s", self.usage.cpu_s, 0.0, MAX_CPU_S)?;
         for summary in &self.stages {
             check_name("stage", &summary.stage)?;
             for time_ms in [summary.p50_ms, summary.p95_ms, summary.p99_ms, summary.max_ms] {

@@ -223,7 +223,13 @@ fn any_stats() -> impl Strategy<Value = Stats> {
             max_ms,
         },
     );
-    (any_process(), ledger, vec(stage, 0..4)).prop_map(|(process, ledger, stages)| Stats { process, ledger, stages })
+    let usage = (0.0..1e6f64, any::<[u64; 2]>()).prop_map(|(cpu_s, [resident_bytes, peak_resident_bytes])| {
+        ProcessUsage { cpu_s, resident_bytes, peak_resident_bytes }
+    });
+    let traffic =
+        (any_topic(), any::<[u64; 2]>()).prop_map(|(topic, [messages, bytes])| TopicTraffic { topic, messages, bytes });
+    (any_process(), ledger, vec(stage, 0..4), usage, vec(traffic, 0..4))
+        .prop_map(|(process, ledger, stages, usage, traffic)| Stats { process, ledger, stages, usage, traffic })
 }
 
 pub(crate) fn any_message() -> impl Strategy<Value = Message> {

@@ -184,6 +184,8 @@ pub(crate) fn every_kind() -> Vec<Message> {
                 p99_ms: 3.0,
                 max_ms: 4.0,
             }],
+            usage: ProcessUsage { cpu_s: 1.5, resident_bytes: 1 << 20, peak_resident_bytes: 2 << 20 },
+            traffic: vec![TopicTraffic { topic: "4279/bev".parse().unwrap(), messages: 3, bytes: 4_500_000 }],
         }),
     ];
     messages.extend(every_codec().iter().map(|config| Message::Bev(bev(config))));

@@ -31,22 +31,22 @@ pub(super) struct SensorPublisher {
 impl SensorPublisher {
     /// Publishers for `agents`. With `is_paced` the sender waits instead of replacing a sweep.
     pub(super) fn open(bus: &Bus, agents: &[CavId], with_radar: bool, is_paced: bool) -> Result<Self, BusError> {
-        let options =
-            if is_paced { PublisherOptions::SENSOR.lossless(LOSSLESS_PLACES) } else { PublisherOptions::SENSOR };
+        let paced = |options: PublisherOptions| if is_paced { options.lossless(LOSSLESS_PLACES) } else { options };
         let sensors = agents.iter().map(|cav| {
-            let publisher = |stream| bus.publisher(Topic::Stream { cav: cav.clone(), stream }, options);
+            let publisher = |stream, options| bus.publisher(Topic::Stream { cav: cav.clone(), stream }, paced(options));
             Ok(Sensors {
-                lidar: publisher(Stream::Lidar)?,
-                gnss: publisher(Stream::Gnss)?,
-                imu: publisher(Stream::Imu)?,
-                radar: with_radar.then(|| publisher(Stream::Radar)).transpose()?,
+                // Small messages have other priorities than sweeps: they do not wait for one on its way to a slow receiver.
+                lidar: publisher(Stream::Lidar, PublisherOptions::SENSOR)?,
+                gnss: publisher(Stream::Gnss, PublisherOptions::POSE)?,
+                imu: publisher(Stream::Imu, PublisherOptions::POSE)?,
+                radar: with_radar.then(|| publisher(Stream::Radar, PublisherOptions::RADAR)).transpose()?,
                 preview: bus.publisher(
                     Topic::Stream { cav: cav.clone(), stream: Stream::Preview },
                     PublisherOptions::PREVIEW,
                 )?,
             })
         });
-        let truth = bus.publisher(Topic::Truth, PublisherOptions::FEATURES.lossless(LOSSLESS_PLACES))?;
+        let truth = bus.publisher(Topic::Truth, PublisherOptions::DETECTIONS.waiting(LOSSLESS_PLACES))?;
         Ok(Self { sensors: sensors.collect::<Result<_, _>>()?, truth, sent: Vec::new() })
     }
 

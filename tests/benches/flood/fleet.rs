@@ -10,8 +10,8 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result, bail};
 use bus::bounded_queue::Pop;
 use bus::{
-    AccessControl, Bus, BusOptions, Credentials, Endpoint, Event, Identity, InboxLimits, PublisherOptions, open,
-    unix_nanos,
+    AccessControl, Bus, BusOptions, Credentials, Endpoint, Event, Identity, InboxLimits, PublisherOptions,
+    SharedMemory, open, unix_nanos,
 };
 use protocol::message::Bev;
 use protocol::{
@@ -160,7 +160,10 @@ pub(crate) fn run_part(arguments: &[String]) -> Result<()> {
     let place = Place {
         endpoint: Endpoint::new(endpoint)?,
         keys: (!keys.is_empty()).then(|| PathBuf::from(keys)),
-        shm: Some(shm_mib.parse::<usize>()? << 20).filter(|bytes| *bytes > 0),
+        shm: match shm_mib.parse::<usize>()? {
+            0 => SharedMemory::Off,
+            mib => SharedMemory::Pool(mib << 20),
+        },
     };
     let duration = Duration::from_secs_f64(seconds.parse()?);
     match name.as_str() {
@@ -174,12 +177,12 @@ pub(crate) fn run_part(arguments: &[String]) -> Result<()> {
 struct Place {
     endpoint: Endpoint,
     keys: Option<PathBuf>,
-    shm: Option<usize>,
+    shm: SharedMemory,
 }
 
 impl Place {
     fn with_memory(&self, options: BusOptions) -> BusOptions {
-        BusOptions { shared_memory_pool: self.shm, ..options }
+        BusOptions { shared_memory: self.shm, ..options }
     }
 
     fn join(&self, principal: &str) -> Result<Bus> {

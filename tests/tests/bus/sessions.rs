@@ -1,11 +1,12 @@
 //! Bus through real zenoh sessions: a router and clients on loopback.
 
+use std::collections::BTreeMap;
 use std::sync::mpsc;
 use std::time::{Duration, Instant};
 
 use bus::{
     self, Barrier, Bus, BusError, BusOptions, Endpoint, Event, LivelinessEvent, Overflow, Publisher, PublisherOptions,
-    Route, bounded_queue::Pop,
+    Route, SharedMemory, SharedMemoryUse, bounded_queue::Pop,
 };
 use protocol::{
     Account, CavId, Control, DropReason, Gnss, GnssSource, Ledger, Lidar, Limits, PointCloud, Pose, Role, Stamp,
@@ -382,10 +383,10 @@ fn what_was_sent_before_leaving_arrives() {
 
 #[test]
 fn shared_memory_carries_the_same_messages() {
-    let router = TestRouter::open();
+    let router = TestRouter::with(|options| BusOptions { shared_memory: SharedMemory::Attached, ..options });
     let join = |process: &str, cav_id: &str| {
         let mut options = BusOptions::client(router.endpoint.clone());
-        options.shared_memory_pool = Some(64 << 20);
+        options.shared_memory = SharedMemory::Pool(64 << 20);
         let identity =
             bus::Identity { run: "test".parse().unwrap(), process: process.parse().unwrap(), cav: cav(cav_id) };
         Bus::join(&options, identity).unwrap()
@@ -407,4 +408,39 @@ fn shared_memory_carries_the_same_messages() {
         agent.stats().received(&topic);
     }
     balanced(&[&replay, &agent]);
+    assert_eq!(replay.stats().shared_memory(), [(SharedMemoryUse::Carried, 20)].into());
+}
+
+/// Sends five sweeps of 960 kB from a process with a pool of `pool_mib`; how they went.
+fn shared_memory_use(router: SharedMemory, pool_mib: usize) -> BTreeMap<SharedMemoryUse, u64> {
+    let router = TestRouter::with(|options| BusOptions { shared_memory: router, ..options });
+    let options =
+        BusOptions { shared_memory: SharedMemory::Pool(pool_mib << 20), ..BusOptions::client(router.endpoint.clone()) };
+    let identity =
+        bus::Identity { run: "test".parse().unwrap(), process: "replay".parse().unwrap(), cav: cav("replay") };
+    let (replay, agent) = (Bus::join(&options, identity).unwrap(), router.join("agent-7", "7"));
+    let topic = Topic::Stream { cav: cav("7"), stream: Stream::Lidar };
+    let publisher = replay.publisher(topic.clone(), PublisherOptions::SENSOR.lossless(8)).unwrap();
+    let inbox = agent.inbox(64, 1);
+    let _subscription = agent.subscribe(topic.clone(), &inbox).unwrap();
+    connect(&replay, &agent, &topic);
+    (0..5).for_each(|tick| publisher.submit(tick, sweep(60_000)));
+    publisher.finish();
+    for _ in 0..5 {
+        let (_, Event::Message(arrival)) = next_event(&inbox) else { panic!("an end before the last message") };
+        assert_eq!(inbox.decode::<Lidar>(&arrival, &Limits::DEFAULT), Some(sweep(60_000)));
+    }
+    replay.stats().shared_memory()
+}
+
+#[test]
+fn messages_beside_shared_memory_arrive_and_are_counted() {
+    // One message has 960 kB: a pool of 1 MiB holds one, beside zenoh's own data none.
+    let small = shared_memory_use(SharedMemory::Attached, 1);
+    assert!(small.get(&SharedMemoryUse::PoolFull).is_some_and(|count| *count > 0), "{small:?}");
+    assert_eq!(small.values().sum::<u64>(), 5);
+    // A receiver without shared memory: the sender has put its messages there all the same.
+    assert_eq!(shared_memory_use(SharedMemory::Attached, 64), [(SharedMemoryUse::Carried, 5)].into());
+    assert_eq!(shared_memory_use(SharedMemory::Attached, 0), BTreeMap::new());
+    assert_eq!(shared_memory_use(SharedMemory::Off, 64), [(SharedMemoryUse::RouterNotAttached, 5)].into());
 }

@@ -3,6 +3,8 @@
 mod damaged_inputs;
 mod failed_parts;
 mod processes;
+mod receivers;
+mod shared_memory;
 
 use peak_alloc::PeakAlloc;
 

@@ -110,6 +110,34 @@ fn eval_prints_the_summary_and_writes_the_requested_files() {
 }
 
 #[test]
+fn a_tracked_vehicle_has_an_accurate_pose_in_every_sweep_of_a_drive() {
+    let folder = tempfile::tempdir().unwrap();
+    let synth = Command::new(programs().join("sim-replay"))
+        .args(["synth", "--subset", "town1loc", "--seed", "1600", "--traversals", "1"])
+        .args(["--frames", "20", "--period", "0.1", "--threads", "1", "--out"])
+        .arg(folder.path().join("scene"))
+        .output()
+        .unwrap();
+    assert!(synth.status.success(), "{}", String::from_utf8_lossy(&synth.stderr));
+    let weights = Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy/weights");
+    let networks = ["pgc-encoder.safetensors", "pgc-town1.safetensors"].map(|name| weights.join(name));
+    let (code, output, stderr) = eval(folder.path(), &networks[0], &networks[1], &["--tracked", "--json"]);
+    assert_eq!(code, Some(0), "{stderr}");
+    let summaries: Value = serde_json::from_str(&output).unwrap();
+    let tracked = &summaries["tracked"];
+    assert_eq!(
+        (&summaries["pgc"]["sweeps"], &tracked["sweeps"], &tracked["no_pose"]),
+        (&20.into(), &20.into(), &0.into())
+    );
+    assert!(tracked["p50_m"].as_f64().unwrap() < 0.2 && tracked["max_m"].as_f64().unwrap() < 1.0, "{output}");
+    let integrity = &tracked["integrity"];
+    assert_eq!(integrity["poses"], 20);
+    assert!(integrity["exceeded_share"].as_f64().unwrap() < 0.2, "{integrity}");
+    // Half of the sweeps are not measured, the others hardly searched.
+    assert!(tracked["mean_ms"].as_f64().unwrap() < summaries["pgc"]["mean_ms"].as_f64().unwrap(), "{output}");
+}
+
+#[test]
 fn competitors_are_evaluated_on_the_same_sweeps_with_the_same_numbers() {
     let folder = tempfile::tempdir().unwrap();
     let (encoder, _) = scene_and_networks(folder.path());

@@ -2,6 +2,7 @@
 
 mod compressor;
 mod in_process;
+mod live_figures;
 mod localization;
 mod processes;
 mod simulation_time;

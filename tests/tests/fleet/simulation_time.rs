@@ -211,7 +211,7 @@ fn losses_are_counted_and_come_from_the_seed() {
     assert_ne!(run(2).1, ledger);
 }
 
-const FILES: [&str; 4] = ["metrics.json", "frames.csv", "ledger.json", "detections.jsonl"];
+const FILES: [&str; 5] = ["metrics.json", "frames.csv", "ledger.json", "detections.jsonl", "truth.jsonl"];
 
 fn assert_same_bytes(one: &RunResult, other: &RunResult) {
     for name in FILES {

@@ -257,8 +257,8 @@ impl Detector {
     /// # Errors
     /// [`DetectorError::Shape`] if the feature map is not of this detector.
     pub fn heads(&self, features: &Tensor) -> Result<Heads, DetectorError> {
-        let map = one_map(features, self.map_shape())?;
-        tch::no_grad(|| Heads::new(&self.head.forward(&map)?))
+        let map = checked(features, self.map_shape())?;
+        tch::no_grad(|| Heads::new(&self.head.forward_one(&map)?))
     }
 
     /// Boxes above a score, in the frame of the feature map's vehicle, not yet suppressed.
@@ -296,15 +296,22 @@ impl Detector {
     }
 }
 
-/// A feature map `[1, C, H, W]` or `[C, H, W]` of the expected shape as `[1, C, H, W]`.
+/// A feature map `[1, C, H, W]` or `[C, H, W]` of the expected shape as `[1, C, H, W]`, channel by channel in memory.
 fn one_map(features: &Tensor, expected: [i64; 3]) -> Result<Tensor, DetectorError> {
+    // One memory layout, or the same values would give other last bits.
+    Ok(checked(features, expected)?.f_contiguous()?)
+}
+
+/// The same in its own memory order.
+fn checked(features: &Tensor, expected: [i64; 3]) -> Result<Tensor, DetectorError> {
     let found = features.size();
-    if found != expected && found.split_first() != Some((&1, expected.as_slice())) {
+    if found == expected {
+        return Ok(features.f_unsqueeze(0)?);
+    }
+    if found.split_first() != Some((&1, expected.as_slice())) {
         return Err(DetectorError::Shape { what: "feature map", found, expected });
     }
-    let [channels, height, width] = expected;
-    // One memory layout, or the same values would give other last bits.
-    Ok(features.f_contiguous()?.f_view([1, channels, height, width])?)
+    Ok(features.shallow_clone())
 }
 
 #[cfg(test)]

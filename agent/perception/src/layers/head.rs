@@ -49,11 +49,55 @@ impl DetectionHead {
         let apply = |conv: &nn::Conv2D| features.f_conv2d(&conv.ws, conv.bs.as_ref(), [1, 1], [0, 0], [1, 1], 1);
         Ok(HeadOutput { scores: apply(&self.scores)?, offsets: apply(&self.offsets)? })
     }
+
+    /// The same of one map `[1, C, H, W]` for inference: one matrix product, in whatever order the map is in memory.
+    ///
+    /// # Errors
+    /// As [`Self::forward`].
+    pub fn forward_one(&self, map: &Tensor) -> Result<HeadOutput, TchError> {
+        let (_, _, height, width) = map.size4()?;
+        let both = [&self.scores, &self.offsets];
+        let weight = Tensor::f_cat(&both.map(|conv| &conv.ws), 0)?.f_flatten(1, 3)?;
+        let cells = map.f_squeeze_dim(0)?.f_flatten(1, 2)?;
+        let output = match both.map(|conv| conv.bs.as_ref()) {
+            [Some(scores), Some(offsets)] => {
+                Tensor::f_cat(&[scores, offsets], 0)?.f_unsqueeze(1)?.f_addmm(&weight, &cells)?
+            }
+            _ => weight.f_mm(&cells)?,
+        };
+        let anchors = self.scores.ws.size4()?.0;
+        let of = |first: i64, count: i64| output.f_narrow(0, first, count)?.f_view([1, count, height, width]);
+        Ok(HeadOutput { scores: of(0, anchors)?, offsets: of(anchors, BOX_CODE * anchors)? })
+    }
 }
 
 impl HeadOutput {
     /// Confidence of a vehicle around each cell: `[B, H, W]`, 0..1, the best of its anchors.
     pub fn confidence(&self) -> Tensor {
         self.scores.amax([1], false).sigmoid().to_kind(Kind::Float)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use tch::Device;
+    use tch::nn::VarStore;
+
+    use super::*;
+
+    #[test]
+    fn one_product_gives_what_two_convolutions_give_in_either_memory_order() {
+        let variables = VarStore::new(Device::Cpu);
+        let head = DetectionHead::new(&variables.root(), 5, 2);
+        let planes = Tensor::rand([1, 5, 6, 8], (Kind::Float, Device::Cpu));
+        let expected = head.forward(&planes).unwrap();
+        let cells = planes.permute([0, 2, 3, 1]).contiguous().permute([0, 3, 1, 2]);
+        for map in [planes, cells] {
+            let found = head.forward_one(&map).unwrap();
+            assert_eq!(found.offsets.size(), [1, 14, 6, 8]);
+            assert!(found.scores.allclose(&expected.scores, 1e-5, 1e-6, false));
+            assert!(found.offsets.allclose(&expected.offsets, 1e-5, 1e-6, false));
+        }
+        assert!(head.forward_one(&Tensor::zeros([1, 4, 6, 8], (Kind::Float, Device::Cpu))).is_err());
     }
 }

@@ -134,37 +134,25 @@ mod tests {
     use fusion::Method;
     use localization::pose_source::PoseSourceConfig;
 
-    use dataset::LeftOut;
     use dataset::evaluation_protocol::ProtocolConfig;
 
     use super::super::CellKey;
     use super::*;
-    use crate::score::metrics::{Communication, Contribution, Latencies, Messages, Metrics, Percentiles, PoseErrors};
+    use crate::score::metrics::tests::metrics as sample;
+    use crate::score::metrics::{Communication, Metrics};
 
     fn cell(method: Method, at_50: f64) -> Cell {
         let ap = ByIou { at_30: Some(0.9), at_50: Some(at_50), at_70: None };
         let metrics = Metrics {
-            frames: 60,
-            seconds: 6.0,
             clock: "offline".into(),
-            method: method.name().into(),
-            pose_source: "recorded".into(),
             ap_global: ap,
-            answered: None,
-            contribution: Contribution::default(),
             ap_frame_order: ap,
-            pose: PoseErrors::default(),
-            latency_ms: Latencies::default(),
-            age_ms: Percentiles::default(),
-            neighbours: BTreeMap::new(),
             comm: Communication {
                 payload_bytes_mean: Some(1024.0),
                 log2_payload: Some(10.0),
                 ..Communication::default()
             },
-            messages: Messages::default(),
-            protocol: None,
-            left_out: LeftOut::default(),
+            ..sample(method.name())
         };
         let key = CellKey {
             method,

@@ -7,6 +7,7 @@ use std::process::{ExitStatus, Stdio};
 use std::sync::mpsc::Sender;
 use std::time::{Duration, Instant};
 
+use bus::malloc_settings;
 use rustix::process::{Pid, Signal, kill_process};
 use tokio::process::{Child, Command};
 use tokio::sync::{mpsc, watch};
@@ -128,7 +129,12 @@ impl Watcher {
     }
 
     fn spawn(&self) -> std::io::Result<Child> {
-        Command::new(&self.spec.program)
+        let mut command = Command::new(&self.spec.program);
+        let (name, of_router) = malloc_settings::ROUTER_THREADS;
+        if std::env::var_os(name).is_some_and(|value| value == of_router) {
+            command.env_remove(name);
+        }
+        command
             .args(&self.spec.args)
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())

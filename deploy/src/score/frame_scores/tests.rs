@@ -129,8 +129,35 @@ fn a_tick_without_result_is_missed_and_a_second_result_ignored() {
     board.result(&stamp("e", 1, 50), result(1, &[10.0]));
     board.result(&stamp("e", 1, 90), result(1, &[]));
     board.close();
-    assert_eq!((board.missed(), board.records().len()), (2, 1));
-    assert_eq!((board.records()[0].latency_ms, board.records()[0].detected), (Some(50.0), 1));
+    assert_eq!((board.missed(), board.ticks()), (2, (3, 1)));
+    let answered: Vec<bool> = board.records().iter().map(FrameRecord::is_answered).collect();
+    assert_eq!(answered, [false, true, false], "every tick has a record");
+    assert_eq!((board.records()[1].latency_ms, board.records()[1].detected), (Some(50.0), 1));
+}
+
+/// Three precisions of hand-made ticks, 100 ms apart, with two cars that stand still in front of an ego that stands too:
+/// tick 0 is answered in full after 50 ms, tick 1 not at all, tick 2 in full after 250 ms, tick 3 with one car.
+#[test]
+fn the_three_precisions_differ_in_what_they_count() {
+    let mut board = board();
+    let began_ms = |tick: u64| 1_000 + 100 * tick;
+    for tick in 0..4 {
+        board.truth(&stamp("replay", tick, began_ms(tick)), truth(tick));
+    }
+    for (tick, latency_ms, at_x) in [(0, 50, &[10.0, 30.0][..]), (2, 250, &[10.0, 30.0]), (3, 20, &[10.0])] {
+        board.result(&stamp("e", tick, began_ms(tick) + latency_ms), result(tick, at_x));
+    }
+    board.close();
+    let is_near = |found: Option<f64>, expected: f64| (found.unwrap() - expected).abs() < 1e-9;
+    // Five of the six boxes of the answered ticks, and five of the eight of all.
+    assert!(is_near(board.average_precision().0.at_50, 5.0 / 6.0));
+    assert!(is_near(board.unanswered_empty().at_50, 5.0 / 8.0));
+    // Nothing is published by tick 0; its result is the newest at the three that follow: 6 of 8 boxes.
+    assert!(is_near(board.streaming().unwrap().at_50, 6.0 / 8.0));
+    let streamed: Vec<Option<u64>> = board.records().iter().map(|record| Some(record.streamed?.tick)).collect();
+    assert_eq!(streamed, [None, Some(0), Some(0), Some(0)]);
+    assert_eq!(board.records()[2].streamed.map(|streamed| (streamed.age_ms, streamed.found)), Some((200.0, 2)));
+    assert_eq!(board.ticks(), (4, 3));
 }
 
 #[test]

@@ -19,7 +19,7 @@ pub struct Contribution {
 impl Contribution {
     /// Summarises the ledger of a run of `ego`: in `frames` frames `fused` neighbours were fused. `sent_bytes` is the
     /// size of all messages that were sent, if known.
-    pub(crate) fn of(frames: usize, fused: usize, ego: &CavId, ledger: &Ledger, sent_bytes: Option<u64>) -> Self {
+    pub(crate) fn of(frames: u64, fused: usize, ego: &CavId, ledger: &Ledger, sent_bytes: Option<u64>) -> Self {
         let of_neighbours = || ledger.iter().filter(|(account, _)| shares(&account.topic, ego));
         let is_sent = |account: &Account| matches!(account.topic, Topic::Stream { .. });
         let sent = of_neighbours().filter(|(account, _)| is_sent(account)).map(|(_, counts)| counts.sent).sum();

@@ -79,6 +79,9 @@ function facts(frame) {
   $("time").textContent = `${number(frame.capture_s, 1)} s`;
   $("method").textContent = frame.method || "–";
   $("latency").textContent = ms(frame.latency_ms);
+  const { answered, ticks, rate_hz: rate } = frame.pace;
+  const share = ticks ? ` (${number(100 * answered / ticks, 0)} %)` : "";
+  $("answered").textContent = `${answered}/${ticks}${share}${rate === null ? "" : `, ${number(rate, 1)} Hz`}`;
   $("detected").textContent = `${frame.detections.length} detected, ${frame.truth.length} there`;
   $("detected").title = "boxes detected; all that vehicles annotate, in range or not";
 }

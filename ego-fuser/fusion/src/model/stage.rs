@@ -16,7 +16,7 @@ use crate::full_resolution::FullResolutionMap;
 use crate::maps::{AlignedMaps, EarlierMaps, MapMetadata, ReceivedMaps, larger_cells, with_cells_of};
 use crate::method::{Exchange, Method};
 use crate::settings::{FUSION_KEY, FusionConfig, Requirements};
-use crate::warp::{Order, WarpError, WarpedMaps, warp_in_order};
+use crate::warp::{Order, WarpError, WarpedMaps, check, warp_cells, warp_to_ego};
 use crate::{Fusion, FusionOutput};
 
 /// Prefix of the fusion's variables in a weights file.
@@ -120,16 +120,19 @@ impl FusionStage {
         }
         let earlier = received.only(newest, count)?;
         let then = then_from_cav(&self.of_network(metadata), newest as usize);
-        let earlier = self.kept(&earlier, &self.turned(&earlier.maps, &then)?)?;
+        let turned = ReceivedMaps::new(
+            self.turned(&earlier.maps, &then, self.order())?,
+            earlier.sent.as_ref().map(Tensor::shallow_clone),
+        );
+        let earlier = self.kept(&earlier, &turned)?;
         self.align_with(&received.only(0, newest.min(count))?, Some(earlier), metadata)
     }
 
-    /// The form in which maps are kept for later frames, given the same maps in the axes of the ego, `turned`
-    /// `[N, C, H, W]`.
+    /// The form in which maps are kept for later frames, given the same maps in the axes of the ego, `turned`.
     ///
     /// # Errors
     /// [`TchError`] when the maps have not four dimensions.
-    pub fn kept(&self, received: &ReceivedMaps, turned: &Tensor) -> Result<ReceivedMaps, TchError> {
+    pub fn kept(&self, received: &ReceivedMaps, turned: &ReceivedMaps) -> Result<ReceivedMaps, TchError> {
         let ReceivedMaps { maps, sent, .. } = received;
         let history = self.requirements.history;
         let kept = match history.earlier_cells {
@@ -140,20 +143,26 @@ impl FusionStage {
             ),
             None => ReceivedMaps::new(maps.shallow_clone(), sent.as_ref().map(Tensor::shallow_clone)),
         };
-        let full_resolution = |map: i64| {
-            let of = |tensor: &Tensor| tensor.f_narrow(0, map, 1);
-            FullResolutionMap::of(&of(turned)?, sent.as_ref().map(of).transpose()?.as_ref())
+        let full_resolution = match history.full_resolution {
+            true if turned.full_resolution.is_empty() => full_resolution(turned)?,
+            true => turned.full_resolution.iter().map(FullResolutionMap::shallow_clone).collect(),
+            false => Vec::new(),
         };
-        let count = if history.full_resolution { maps.size4()?.0 } else { 0 };
-        Ok(ReceivedMaps { full_resolution: (0..count).map(full_resolution).collect::<Result<_, TchError>>()?, ..kept })
+        Ok(ReceivedMaps { full_resolution, ..kept })
     }
 
     /// Maps in the axes of the ego.
-    fn turned(&self, maps: &Tensor, poses: &[Pose]) -> Result<Tensor, TchError> {
+    fn turned(&self, maps: &Tensor, poses: &[Pose], order: Order) -> Result<Tensor, TchError> {
         match &self.mixing {
-            Some(mixing) => mixing.turn(maps, poses),
+            Some(mixing) => mixing.turn(maps, poses, order),
             None => Ok(maps.shallow_clone()),
         }
+    }
+
+    /// Memory order in which the fusion reads its maps: one with pooled earlier maps takes the maximum over the newest
+    /// cell by cell.
+    fn order(&self) -> Order {
+        if self.requirements.history.earlier_cells.is_some() { Order::Cells } else { Order::Planes }
     }
 
     /// [`Self::align`] with earlier maps in the form of [`Self::kept`].
@@ -172,23 +181,20 @@ impl FusionStage {
         if maps != metadata.len() as i64 {
             return Err(WarpError::PoseCount { maps, poses: metadata.len() });
         }
-        let cells = self.requirements.history.earlier_cells;
-        // A fusion with pooled earlier maps takes the maximum over the newest, cell by cell.
-        let order = if cells.is_some() { Order::Cells } else { Order::Planes };
-        let earlier = match (cells, earlier) {
+        let earlier = match (self.requirements.history.earlier_cells, earlier) {
             (Some(cells), Some(earlier)) => {
                 let metadata = metadata.split_off(count as usize);
-                let (_, warped) = self.warped(&earlier, &metadata, &with_cells_of(&self.grid, cells), order)?;
+                let (_, warped) = self.warped(&earlier, &metadata, &with_cells_of(&self.grid, cells))?;
                 let classes = self.classes.as_ref().map(Classes::shallow_clone);
                 let full_resolution = classes.map(|classes| (earlier.full_resolution, classes));
                 Some(EarlierMaps { warped, metadata, full_resolution })
             }
             (None, Some(earlier)) => {
-                return self.aligned(&ReceivedMaps::together(&[newest, &earlier])?, None, metadata, order);
+                return self.aligned(&ReceivedMaps::together(&[newest, &earlier])?, None, metadata);
             }
             (_, None) => None,
         };
-        self.aligned(newest, earlier, metadata, order)
+        self.aligned(newest, earlier, metadata)
     }
 
     fn aligned(
@@ -196,9 +202,8 @@ impl FusionStage {
         received: &ReceivedMaps,
         earlier: Option<EarlierMaps>,
         metadata: Vec<MapMetadata>,
-        order: Order,
     ) -> Result<AlignedMaps, WarpError> {
-        let (received, warped) = self.warped(received, &metadata, &self.grid, order)?;
+        let (received, warped) = self.warped(received, &metadata, &self.grid)?;
         Ok(AlignedMaps { warped, received, metadata, grid: self.grid, earlier, is_training: false })
     }
 
@@ -208,12 +213,18 @@ impl FusionStage {
         ReceivedMaps { maps, sent, .. }: &ReceivedMaps,
         metadata: &[MapMetadata],
         grid: &BevGrid,
-        order: Order,
     ) -> Result<(ReceivedMaps, WarpedMaps), WarpError> {
         let poses: Vec<Pose> = metadata.iter().map(|map| map.ego_from_cav).collect();
-        let maps = self.turned(maps, &poses)?;
-        let warped = warp_in_order(&maps, sent.as_ref(), &poses, grid, order)?;
-        Ok((ReceivedMaps::new(maps, sent.as_ref().map(Tensor::shallow_clone)), warped))
+        check(maps, &poses, grid)?;
+        let maps = self.turned(maps, &poses, self.order())?;
+        let mut turned = ReceivedMaps::new(maps, sent.as_ref().map(Tensor::shallow_clone));
+        if self.order() == Order::Planes || !are_numbers(&turned.maps) {
+            let warped = warp_to_ego(&turned.maps, sent.as_ref(), &poses, grid)?;
+            return Ok((turned, warped));
+        }
+        turned.full_resolution = full_resolution(&turned)?;
+        let warped = warp_cells(&turned.full_resolution, &poses, grid)?;
+        Ok((turned, warped))
     }
 
     /// Fuses aligned maps into one in the frame of the ego.
@@ -232,6 +243,15 @@ impl FusionStage {
         let mirrored = metadata.iter().map(|map| MapMetadata { ego_from_cav: map.ego_from_cav.mirrored_y(), ..*map });
         Cow::Owned(mirrored.collect())
     }
+}
+
+/// Each of the maps at full resolution.
+fn full_resolution(ReceivedMaps { maps, sent, .. }: &ReceivedMaps) -> Result<Vec<FullResolutionMap>, TchError> {
+    let of_map = |map: i64| {
+        let of = |tensor: &Tensor| tensor.f_narrow(0, map, 1);
+        FullResolutionMap::of(&of(maps)?, sent.as_ref().map(of).transpose()?.as_ref())
+    };
+    (0..maps.size4()?.0).map(of_map).collect()
 }
 
 /// Number of leading entries that are the newest of their agents.

@@ -8,6 +8,7 @@ use protocol::Pose;
 use tch::{Kind, TchError, Tensor};
 
 use super::config::PastatConfig;
+use crate::full_resolution::FullResolutionMap;
 use crate::maps::{AlignedMaps, MapMetadata};
 use crate::padding::Padding;
 use crate::warp::WarpedMaps;
@@ -29,6 +30,8 @@ pub(super) struct CoarseMaps {
     pub(super) newest: WarpedMaps,
     /// The same in the frames of their senders, not padded; the mask marks the cells that were sent.
     pub(super) received: WarpedMaps,
+    /// The same in plain floats; none where a gradient flows.
+    pub(super) received_cells: Vec<FullResolutionMap>,
     /// Earlier maps, pooled, on a padded grid of the ego.
     pub(super) earlier: Option<WarpedMaps>,
     /// Indices of these among [`AlignedMaps::earlier`].
@@ -79,6 +82,10 @@ impl CoarseAlignment {
         Ok(CoarseMaps {
             newest: padded(&rows_of(&warped.features, &warped.mask, &newest)?, self.padding_cells)?,
             received: rows_of(&received.maps, &sent, &newest)?,
+            received_cells: {
+                let of_entry = |&entry: &i64| received.full_resolution.get(entry as usize);
+                newest.iter().filter_map(of_entry).map(FullResolutionMap::shallow_clone).collect()
+            },
             earlier: match earlier.as_ref().filter(|_| !earlier_entries.is_empty()) {
                 Some(earlier) => {
                     let WarpedMaps { features, mask } = &earlier.warped;

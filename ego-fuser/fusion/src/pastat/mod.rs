@@ -117,7 +117,7 @@ impl Fusion for Pastat {
         if let Some(memory) = &self.temporal_memory {
             fused = memory.blend(fused, maps, &coarse, &fine, &context)?;
         }
-        fused = cropped(&(fused + self.decoder.change(&context)?), &maps.warped.features)?;
+        fused = cropped(&self.decoder.changed(&fused, &context)?, &maps.warped.features)?;
         if let Some(refinement) = &self.map_refinement {
             fused = refinement.forward(&fused, maps.is_training)?;
         }

@@ -13,7 +13,8 @@ use protocol::{BevGrid, Pose};
 use tch::{Kind, TchError, Tensor};
 
 pub(crate) use self::sampling::{Cells, Order};
-use crate::f64_tensor::{self, are_numbers, as_batch};
+use crate::f64_tensor::{are_numbers, as_batch};
+use crate::full_resolution::FullResolutionMap;
 
 /// `grid_sampler` reads zeros outside of the map.
 pub(crate) const PADDING_ZEROS: i64 = 0;
@@ -93,25 +94,8 @@ pub fn warp_to_ego(
     ego_from_cav: &[Pose],
     grid: &BevGrid,
 ) -> Result<WarpedMaps, WarpError> {
-    warp_in_order(features, sent, ego_from_cav, grid, Order::Planes)
-}
-
-/// The same with a given memory order of the result, where no gradient flows.
-pub(crate) fn warp_in_order(
-    features: &Tensor,
-    sent: Option<&Tensor>,
-    ego_from_cav: &[Pose],
-    grid: &BevGrid,
-    order: Order,
-) -> Result<WarpedMaps, WarpError> {
-    let size = features.size();
-    let &[maps, _, height, width] = size.as_slice() else { return Err(shape_error(size, grid)) };
-    if (height, width) != (i64::from(grid.height), i64::from(grid.width)) {
-        return Err(shape_error(size, grid));
-    }
-    if maps != ego_from_cav.len() as i64 {
-        return Err(WarpError::PoseCount { maps, poses: ego_from_cav.len() });
-    }
+    check(features, ego_from_cav, grid)?;
+    let (maps, _, height, width) = features.size4()?;
     let sent = match sent {
         Some(sent) => sent.f_view([maps, 1, height, width])?,
         None => Tensor::f_ones([1, 1, height, width], (Kind::Float, features.device()))?
@@ -127,31 +111,72 @@ pub(crate) fn warp_in_order(
         let map = features.f_narrow(0, index as i64, 1)?;
         let sent = sent.f_narrow(0, index as i64, 1)?;
         if *affine == UNMOVED {
-            moved.push(match order {
-                Order::Planes => map,
-                Order::Cells => f64_tensor::by_cell(&map.f_squeeze_dim(0)?)?,
-            });
+            moved.push(map);
             masks.push(sent.f_to_kind(features.kind())?);
             continue;
         }
         let sampling_grid = sampling_grid(*affine, grid)?.f_to_device(features.device())?;
-        let (map, mask) = read(&map, &sent, &sampling_grid, order)?;
+        let (map, mask) = read(&map, &sent, &sampling_grid)?;
         moved.push(map);
         masks.push(mask);
     }
-    let features = match order {
-        Order::Cells => one_after_another(&moved)?,
-        Order::Planes => Tensor::f_cat(&moved, 0)?,
-    };
-    Ok(WarpedMaps { features, mask: Tensor::f_cat(&masks, 0)? })
+    Ok(WarpedMaps { features: Tensor::f_cat(&moved, 0)?, mask: Tensor::f_cat(&masks, 0)? })
+}
+
+/// [`warp_to_ego`] of maps in plain floats: the channels of each cell are contiguous in the result too.
+pub(crate) fn warp_cells(
+    maps: &[FullResolutionMap],
+    ego_from_cav: &[Pose],
+    grid: &BevGrid,
+) -> Result<WarpedMaps, WarpError> {
+    let count = maps.len() as i64;
+    let cells = (grid.height * grid.width) as usize;
+    let (mut features, mut mask) = (Vec::new(), Vec::with_capacity(maps.len() * cells));
+    for (map, pose) in maps.iter().zip(ego_from_cav) {
+        let FullResolutionMap::Numbers { cells: map, sent } = map else { continue };
+        features.reserve(maps.len() * map.values().len() - features.len());
+        let affine = cav_from_ego_normalized(pose, grid);
+        if affine == UNMOVED {
+            features.extend_from_slice(map.values());
+            mask.extend_from_slice(sent);
+        } else {
+            map.append(sent, &places(affine, grid), [&mut features, &mut mask]);
+        }
+    }
+    let [height, width] = [grid.height, grid.width].map(i64::from);
+    let features = Tensor::f_from_slice(&features)?.f_view([count, height, width, -1])?.f_permute([0, 3, 1, 2])?;
+    Ok(WarpedMaps { features, mask: Tensor::f_from_slice(&mask)?.f_view([count, 1, height, width])? })
+}
+
+/// Checks that maps `[N, C, H, W]` lie on `grid`, one for each pose.
+///
+/// # Errors
+/// [`WarpError`] states both sizes or counts.
+pub(crate) fn check(maps: &Tensor, ego_from_cav: &[Pose], grid: &BevGrid) -> Result<(), WarpError> {
+    let size = maps.size();
+    let &[maps, _, height, width] = size.as_slice() else { return Err(shape_error(size, grid)) };
+    if (height, width) != (i64::from(grid.height), i64::from(grid.width)) {
+        return Err(shape_error(size, grid));
+    }
+    if maps != ego_from_cav.len() as i64 {
+        return Err(WarpError::PoseCount { maps, poses: ego_from_cav.len() });
+    }
+    Ok(())
 }
 
 /// Positions of a grid's cells under an affine map of normalised coordinates, `[1, h, w, 2]` for `grid_sampler`.
 fn sampling_grid(affine: [f32; 6], grid: &BevGrid) -> Result<Tensor, TchError> {
+    Tensor::f_from_slice(&places(affine, grid))?.f_view([1, i64::from(grid.height), i64::from(grid.width), 2])
+}
+
+/// The same in plain floats, two for each cell.
+fn places(affine: [f32; 6], grid: &BevGrid) -> Vec<f32> {
     let [rows, columns] = [grid.height, grid.width].map(|count| count as usize);
-    let row = |row| (0..columns).flat_map(move |column| place_of([row, column], affine, grid));
-    let places: Vec<f32> = (0..rows).flat_map(row).collect();
-    Tensor::f_from_slice(&places)?.f_view([1, i64::from(grid.height), i64::from(grid.width), 2])
+    let mut places = Vec::with_capacity(2 * rows * columns);
+    for row in 0..rows {
+        (0..columns).for_each(|column| places.extend_from_slice(&place_of([row, column], affine, grid)));
+    }
+    places
 }
 
 /// The same of one cell, by row and column.
@@ -168,23 +193,13 @@ pub(crate) fn places_of(cells: &[[usize; 2]], ego_from_cav: &Pose, grid: &BevGri
     cells.iter().flat_map(|&cell| place_of(cell, affine, grid)).collect()
 }
 
-/// Maps `[1, C, H, W]` as `[N, C, H, W]`, in their memory order.
-fn one_after_another(maps: &[Tensor]) -> Result<Tensor, TchError> {
-    if !maps.iter().all(are_numbers) {
-        return Tensor::f_cat(maps, 0);
-    }
-    // Copied as a whole.
-    let cells: Vec<Tensor> = maps.iter().map(|map| map.f_permute([0, 2, 3, 1])).collect::<Result<_, _>>()?;
-    Tensor::f_cat(&cells, 0)?.f_permute([0, 3, 1, 2])
-}
-
 /// A map `[1, C, H, W]` and the mask of its sent cells `[1, 1, H, W]`, sampled at `sampling_grid` `[1, h, w, 2]`.
-fn read(map: &Tensor, sent: &Tensor, sampling_grid: &Tensor, order: Order) -> Result<(Tensor, Tensor), TchError> {
+fn read(map: &Tensor, sent: &Tensor, sampling_grid: &Tensor) -> Result<(Tensor, Tensor), TchError> {
     if !are_numbers(map) {
         return read_by_tensors(map, sent, sampling_grid);
     }
     let first = |tensor: &Tensor| tensor.f_squeeze_dim(0);
-    let (map, mask) = Cells::of(&first(map)?)?.read(&first(&first(sent)?)?, &first(sampling_grid)?, order)?;
+    let (map, mask) = Cells::of(&first(map)?)?.read(&first(&first(sent)?)?, &first(sampling_grid)?)?;
     Ok((as_batch(&map)?, mask.f_unsqueeze(0)?))
 }
 
@@ -276,8 +291,9 @@ mod tests {
     fn the_order_of_numbers_in_memory_changes_none_of_them() {
         let maps = uniform(5, &[2, 3, 16, 32]);
         let poses = [Pose::IDENTITY, Pose::from_xyz_yaw([1.3, -0.4, 0.0], 0.2)];
-        let [planes, cells] =
-            [Order::Planes, Order::Cells].map(|order| warp_in_order(&maps, None, &poses, &GRID, order).unwrap());
+        let planes = warp_to_ego(&maps, None, &poses, &GRID).unwrap();
+        let cells: Vec<_> = (0..2).map(|map| FullResolutionMap::of(&maps.narrow(0, map, 1), None).unwrap()).collect();
+        let cells = warp_cells(&cells, &poses, &GRID).unwrap();
         assert_eq!(planes.features, cells.features);
         assert_eq!(planes.mask, cells.mask);
     }
@@ -294,7 +310,7 @@ mod tests {
             let theta = Tensor::from_slice(&affine).view([1, 2, 3]);
             let apart = &sampling_grid - Tensor::affine_grid_generator(&theta, [1, 1, 16, 32], false);
             prop_assert!(apart.abs().max().double_value(&[]) < 1e-4);
-            let (numbers, reached) = read(&map, &sent, &sampling_grid, Order::Planes).unwrap();
+            let (numbers, reached) = read(&map, &sent, &sampling_grid).unwrap();
             let (tensors, mask) = read_by_tensors(&map, &sent, &sampling_grid).unwrap();
             prop_assert_eq!(numbers.size(), tensors.size());
             // At a position between two cells either may be the nearest.

@@ -55,9 +55,9 @@ impl Decoder {
         neighbours.maximum_with(own, &weight)
     }
 
-    /// Additive change of a map by the context: `[1, C, H, W]` of tokens `[1, h, w, D]`, the channels of a cell
+    /// A map `[1, C, H, W]` with the additive change by the context, tokens `[1, h, w, D]`; the channels of a cell are
     /// contiguous in memory.
-    pub(super) fn change(&self, ego: &Tensor) -> Result<Tensor, TchError> {
+    pub(super) fn changed(&self, fused: &Tensor, ego: &Tensor) -> Result<Tensor, TchError> {
         let (_, rows, columns, dim) = ego.size4()?;
         let Self { channels, patch, .. } = *self;
         // Weights are stored by channel and then by cell; transposing these few is cheaper than transposing the result.
@@ -67,7 +67,9 @@ impl Decoder {
         let bias = self.cells.bs.as_ref().map(|bias| by_cell(bias, 1)?.f_squeeze_dim(1)).transpose()?;
         let cells = self.norm.forward(ego).f_linear(&by_cell(&self.cells.ws, dim)?, bias.as_ref())?;
         let cells = cells.f_to_kind(Kind::Float)?.f_view([1, rows, columns, patch, patch, channels].as_slice())?;
-        let cells = cells.f_permute([0, 1, 3, 2, 4, 5])?.f_reshape([1, rows * patch, columns * patch, channels])?;
-        cells.f_permute([0, 3, 1, 2])
+        let fused = fused.f_permute([0, 2, 3, 1])?.f_contiguous()?;
+        let by_patch = fused.f_view([1, rows, patch, columns, patch, channels].as_slice())?;
+        let changed = by_patch.f_add(&cells.f_permute([0, 1, 3, 2, 4, 5])?)?;
+        changed.f_view([1, rows * patch, columns * patch, channels])?.f_permute([0, 3, 1, 2])
     }
 }

@@ -20,6 +20,10 @@ const MARGIN: f64 = 0.05;
 /// A map that was moved further than this, about half a cell of `lean`'s grid, is compared again at its new position.
 const AGAIN_M: f64 = 0.45;
 
+/// A map that correlates with the ego's by this fits where its pose puts it, and is not searched for: in practice the
+/// ego's own earlier maps, which reach 0.8, where neighbours' reach 0.2 to 0.5.
+const FITS: f64 = 0.6;
+
 /// Rotations that are tried besides none, radians: FSA corrects rotations between two of them.
 const TURNS_RAD: [f64; 8] = [-0.08, 0.08, -0.16, 0.16, -0.24, 0.24, -0.32, 0.32];
 /// Largest offset of a rotated map, pooled cells: a small search is cheap, and few poses err far in both.
@@ -49,33 +53,38 @@ impl AlignmentSearch {
         is_training: bool,
     ) -> Result<Displacements, TchError> {
         let nowhere = Tensor::f_zeros([pairs.ego_from_cav.len() as i64, 3], (Kind::Float, pairs.shown.device()))?;
-        let far = match self.config {
-            Some(config) => offsets([&pairs.ego, &pairs.shown], &pairs.ego_from_cav, area, config, is_training)?,
-            None => nowhere.shallow_clone(),
+        let search = |pairs: &Pairs| match self.config {
+            Some(config) => offsets([&pairs.ego, &pairs.shown], &pairs.ego_from_cav, area, config, is_training),
+            None => nowhere.f_narrow(0, 0, pairs.ego_from_cav.len() as i64),
         };
         if is_training {
-            return network.displacements(pairs, &far, area);
+            return network.displacements(pairs, &search(pairs)?, area);
         }
         let near = network.displacements(pairs, &nowhere, area)?;
-        let found = compare_there(network, pairs, near, &far, area)?;
+        let rows = rows_where(&near.similarity.f_lt(FITS)?)?;
+        let found = match rows.is_empty() {
+            true => near,
+            false => compare_there(network, pairs, near, (&rows, &search(&pairs.only(&rows)?)?), area)?,
+        };
         compare_again(network, pairs, found, area)
     }
 }
 
-/// Displacements of the comparison at the poses, `near`, or at `far` `[K, 3]`, metres and radians in the ego's frame,
-/// where the correlation is higher there.
+/// Displacements of the comparison at the poses, `near`, or for some rows at `far` `[rows, 3]`, metres and radians in the
+/// ego's frame, where the correlation is higher there.
 fn compare_there(
     network: &AlignmentNetwork,
     pairs: &Pairs,
     near: Displacements,
-    far: &Tensor,
+    (searched, far): (&[i64], &Tensor),
     area: &Area,
 ) -> Result<Displacements, TchError> {
-    let rows = rows_where(&far.f_count_nonzero_dim_intlist([1_i64].as_slice())?)?;
-    if rows.is_empty() {
+    let moved = rows_where(&far.f_count_nonzero_dim_intlist([1_i64].as_slice())?)?;
+    if moved.is_empty() {
         return Ok(near);
     }
-    let there = network.displacements(&pairs.only(&rows)?, &picked(far, &rows)?, area)?;
+    let rows: Vec<i64> = moved.iter().map(|&row| searched[row as usize]).collect();
+    let there = network.displacements(&pairs.only(&rows)?, &picked(far, &moved)?, area)?;
     let better = rows_where(&there.similarity.f_gt_tensor(&picked(&near.similarity, &rows)?.f_add_scalar(MARGIN)?)?)?;
     let rows: Vec<i64> = better.iter().map(|&row| rows[row as usize]).collect();
     near.with(&rows, &there.only(&better)?)
@@ -141,8 +150,7 @@ fn turned_tries(
     cell_m: f64,
     radius: i64,
 ) -> Result<Vec<(Tensor, Tensor)>, TchError> {
-    let turned = TURNS_RAD.iter().map(|&turn_rad| turned(others, turn_rad, ego_from_cav, area));
-    let turned = Tensor::f_cat(&turned.collect::<Result<Vec<_>, _>>()?, 0)?;
+    let turned = turned(others, &TURNS_RAD, ego_from_cav, area)?;
     // All at once, as the ego's map at each shift is the same for all.
     let fit = Shifted::new(ego, radius, 1)?.correlate(&turned)?.whole.f_sub_scalar(TURN_MARGIN)?;
     let shifts_m = shifts(radius)? * cell_m;
@@ -151,12 +159,15 @@ fn turned_tries(
     fit.f_split(others.size4()?.0, 0)?.into_iter().zip(TURNS_RAD).map(of_turn).collect()
 }
 
-/// Maps rotated about their senders.
-fn turned(maps: &Tensor, turn_rad: f64, ego_from_cav: &[Pose], area: &Area) -> Result<Tensor, TchError> {
+/// All maps rotated about their senders by the first of some angles, then by the second, and so on.
+fn turned(maps: &Tensor, turns_rad: &[f64], ego_from_cav: &[Pose], area: &Area) -> Result<Tensor, TchError> {
     let (count, _, rows, columns) = maps.size4()?;
-    let turn = Tensor::f_from_slice(&[0.0, 0.0, turn_rad as f32])?.f_expand([count, 3], false)?;
-    let places = sampling_grid(&turn, ego_from_cav, area, [rows, columns])?.f_to_device(maps.device())?;
-    maps.f_grid_sampler(&places, BILINEAR, PADDING_ZEROS, false)
+    let deltas: Vec<f32> =
+        turns_rad.iter().flat_map(|&turn_rad| [0.0, 0.0, turn_rad as f32].repeat(count as usize)).collect();
+    let deltas = Tensor::f_from_slice(&deltas)?.f_view([-1, 3])?;
+    let places = sampling_grid(&deltas, &ego_from_cav.repeat(turns_rad.len()), area, [rows, columns])?;
+    let maps = maps.f_repeat([turns_rad.len() as i64, 1, 1, 1])?;
+    maps.f_grid_sampler(&places.f_to_device(maps.device())?, BILINEAR, PADDING_ZEROS, false)
 }
 
 #[cfg(test)]
@@ -209,7 +220,7 @@ mod tests {
         // Vehicles of several pooled cells, whose shape a rotation on pooled cells preserves.
         let ego = map(1).avg_pool2d([9, 9], [1, 1], [4, 4], false, true, None);
         for turn_rad in TURNS_RAD {
-            let turned = turned(&ego, -turn_rad, &[Pose::IDENTITY], &area()).unwrap();
+            let turned = turned(&ego, &[-turn_rad], &[Pose::IDENTITY], &area()).unwrap();
             let moved = turned.roll([8], [3]);
             let others = Tensor::cat(&[&ego, &turned, &moved], 0);
             let turn_rad = turn_rad as f32;

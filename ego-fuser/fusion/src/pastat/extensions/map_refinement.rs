@@ -34,13 +34,13 @@ impl MapRefinement {
     /// `[1, C, H, W]` of a fused map of that shape.
     pub(crate) fn forward(&self, fused: &Tensor, train: bool) -> Result<Tensor, TchError> {
         let kind = if train { Kind::Float } else { fastest(fused.device()) };
-        Ok(fused + self.change(fused, kind)?)
+        self.change(fused, kind)?.f_add_(fused)
     }
 
     /// Additive change, computed in `kind`.
     fn change(&self, fused: &Tensor, kind: Kind) -> Result<Tensor, TchError> {
         let [first, second] = &self.convolutions;
-        let hidden = convolve(first, &fused.f_to_kind(kind)?)?.f_relu()?;
+        let hidden = convolve(first, &fused.f_to_kind(kind)?)?.f_relu_()?;
         convolve(second, &hidden)?.f_to_kind(fused.kind())
     }
 }

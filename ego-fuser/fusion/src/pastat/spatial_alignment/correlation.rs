@@ -1,11 +1,20 @@
 //! Correlation of a neighbour's feature map with the ego's at every shift, part by part of the BEV grid.
 
+use std::cell::OnceCell;
+
 use tch::{Kind, TchError, Tensor};
+
+use crate::f64_tensor::{are_numbers, numbers};
 
 /// Parts of the grid along each edge: enough to distinguish a rotation from a shift.
 pub(crate) const PARTS: i64 = 4;
 /// Prevents division by the norm of an empty part.
 const EPSILON: f64 = 1e-6;
+/// Up to this number of maps, sums in plain floats are faster than a matrix product with the map at every shift, which
+/// has to be written out first.
+const FEW_MAPS: i64 = 4;
+/// Products that are summed side by side.
+const LANES: usize = 8;
 
 /// Similarity of maps, by shift.
 pub(crate) struct Correlation {
@@ -25,13 +34,18 @@ pub(crate) fn shifts(radius: i64) -> Result<Tensor, TchError> {
     Tensor::f_from_slice(&all)?.f_view([-1, 2])
 }
 
-/// The ego's map at every shift, part by part: computed once for all comparisons.
+/// The ego's map, prepared for comparisons at every shift, part by part.
 #[derive(Debug)]
 pub(crate) struct Shifted {
-    /// `[parts^2, K, M * H/parts * W/parts]`.
-    maps: Tensor,
+    /// `[M, H + 2 radius, W + 2 radius]`: the map with zeros around.
+    around: Tensor,
+    /// The same in plain floats, where those are possible.
+    numbers: Option<Vec<f32>>,
+    /// `[parts^2, K, M * H/parts * W/parts]`: the map at every shift, once it is needed.
+    maps: OnceCell<Tensor>,
     /// `[parts^2]`: sums of the squares of the unshifted map.
     squares: Tensor,
+    radius: i64,
     parts: i64,
 }
 
@@ -39,30 +53,20 @@ impl Shifted {
     /// `ego` `[1, M, H, W]`, `H` and `W` multiples of `parts`, moved by up to `radius` cells, in `parts` parts along
     /// each edge. No gradient flows into it: the same layers learn from the other map.
     pub(crate) fn new(ego: &Tensor, radius: i64, parts: i64) -> Result<Self, TchError> {
-        let (_, channels, height, width) = ego.size4()?;
-        let (rows, columns, edge) = (height / parts, width / parts, 2 * radius + 1);
-        let around = ego.f_detach()?.f_constant_pad_nd([radius; 4])?.f_squeeze_dim(0)?;
-        // [M, edge, edge, H, W]: the map at each shift, without a copy until all is sorted by part.
-        let maps = around.f_unfold(1, height, 1)?.f_unfold(2, width, 1)?;
-        let maps = maps
-            .f_view([channels, edge, edge, parts, rows, parts, columns].as_slice())?
-            .f_permute([3, 5, 1, 2, 0, 4, 6])?
-            .f_reshape([parts * parts, edge * edge, channels * rows * columns])?;
-        let still = maps.f_select(1, edge * edge / 2)?;
-        let squares = still.f_square()?.f_sum_dim_intlist([1_i64].as_slice(), false, None)?;
-        Ok(Self { maps, squares, parts })
+        let ego = ego.f_detach()?;
+        let around = ego.f_constant_pad_nd([radius; 4])?.f_squeeze_dim(0)?;
+        let numbers = if are_numbers(&around) { Some(numbers(&around)?) } else { None };
+        let squares = sum_by_part(&ego.f_square()?, parts)?.f_squeeze_dim(1)?;
+        Ok(Self { around, numbers, maps: OnceCell::new(), squares, radius, parts })
     }
 
     /// Compares it with the maps of `others`, `[N, M, H, W]`.
     pub(crate) fn correlate(&self, others: &Tensor) -> Result<Correlation, TchError> {
-        let (count, channels, height, width) = others.size4()?;
-        let parts = self.parts;
-        let others = others
-            .f_reshape([count, channels, parts, height / parts, parts, width / parts])?
-            .f_permute([2, 4, 0, 1, 3, 5])?
-            .f_reshape([parts * parts, count, -1])?;
-        let products = others.f_matmul(&self.maps.f_transpose(1, 2)?)?;
-        let theirs = others.f_square()?.f_sum_dim_intlist([2_i64].as_slice(), false, None)?;
+        let products = match &self.numbers {
+            Some(own) if are_numbers(others) && others.size4()?.0 <= FEW_MAPS => self.sums(own, others)?,
+            _ => by_part(others, self.parts)?.f_matmul(&self.maps()?.f_transpose(1, 2)?)?,
+        };
+        let theirs = sum_by_part(&others.f_square()?, self.parts)?;
         let over_parts = |tensor: &Tensor| tensor.f_sum_dim_intlist([0_i64].as_slice(), false, None);
         let length = |square: Tensor| square.f_add_scalar(EPSILON)?.f_sqrt();
         let energy = length(self.squares.f_unsqueeze(1)? * &theirs)?;
@@ -73,6 +77,81 @@ impl Shifted {
             energy,
         })
     }
+
+    /// `[parts^2, K, M * H/parts * W/parts]`: the map at every shift.
+    fn maps(&self) -> Result<&Tensor, TchError> {
+        if let Some(maps) = self.maps.get() {
+            return Ok(maps);
+        }
+        let (channels, height, width) = self.around.size3()?;
+        let [height, width] = [height, width].map(|length| length - 2 * self.radius);
+        let (parts, edge) = (self.parts, 2 * self.radius + 1);
+        let (rows, columns) = (height / parts, width / parts);
+        // [M, edge, edge, H, W]: the map at each shift, without a copy until all is sorted by part.
+        let maps = self.around.f_contiguous()?.f_unfold(1, height, 1)?.f_unfold(2, width, 1)?;
+        let maps = maps
+            .f_view([channels, edge, edge, parts, rows, parts, columns].as_slice())?
+            .f_permute([3, 5, 1, 2, 0, 4, 6])?
+            .f_reshape([parts * parts, edge * edge, channels * rows * columns])?;
+        Ok(self.maps.get_or_init(|| maps))
+    }
+
+    /// `[parts^2, N, K]`: for each part, map and shift the sum of the products with the ego's map, `own`, in plain
+    /// floats.
+    fn sums(&self, own: &[f32], others: &Tensor) -> Result<Tensor, TchError> {
+        let (count, channels, height, width) = others.size4()?;
+        let values = numbers(others)?;
+        let [channels, height, width, parts, radius] =
+            [channels, height, width, self.parts, self.radius].map(|size| size as usize);
+        let (rows, columns, edge) = (height / parts, width / parts, 2 * radius + 1);
+        let mut sums = vec![[0.0; LANES]; edge * edge];
+        let mut all = Vec::new();
+        for part in 0..parts * parts {
+            let (top, left) = (part / parts * rows, part % parts * columns);
+            for map in values.chunks_exact(channels * height * width) {
+                sums.fill([0.0; LANES]);
+                for (channel, row) in (0..channels).flat_map(|channel| (top..top + rows).map(move |row| (channel, row)))
+                {
+                    let shown = &map[(channel * height + row) * width + left..][..columns];
+                    // Nothing is there, as beyond the edges of a map.
+                    if shown.iter().all(|value| *value == 0.0) {
+                        continue;
+                    }
+                    for (down, sums) in sums.chunks_exact_mut(edge).enumerate() {
+                        let row = (channel * (height + 2 * radius) + row + down) * (width + 2 * radius);
+                        let own = &own[row + left..][..columns + 2 * radius];
+                        sums.iter_mut().zip(own.windows(columns)).for_each(|(sum, own)| add_products(sum, shown, own));
+                    }
+                }
+                all.extend(sums.iter().map(|lanes| lanes.iter().sum::<f32>()));
+            }
+        }
+        Tensor::f_from_slice(&all)?.f_view([(parts * parts) as i64, count, (edge * edge) as i64])
+    }
+}
+
+/// Adds the products of two rows of equal length to sums side by side.
+#[inline]
+fn add_products(sums: &mut [f32; LANES], a: &[f32], b: &[f32]) {
+    let (a_chunks, b_chunks) = (a.chunks_exact(LANES), b.chunks_exact(LANES));
+    let rest = a_chunks.remainder().iter().zip(b_chunks.remainder()).zip(sums.iter_mut());
+    rest.for_each(|((a, b), sum)| *sum += a * b);
+    for (a, b) in a_chunks.zip(b_chunks) {
+        sums.iter_mut().zip(a).zip(b).for_each(|((sum, a), b)| *sum += a * b);
+    }
+}
+
+/// `[parts^2, N, M * H/parts * W/parts]` of maps `[N, M, H, W]`.
+fn by_part(maps: &Tensor, parts: i64) -> Result<Tensor, TchError> {
+    let (count, channels, height, width) = maps.size4()?;
+    maps.f_reshape([count, channels, parts, height / parts, parts, width / parts])?
+        .f_permute([2, 4, 0, 1, 3, 5])?
+        .f_reshape([parts * parts, count, -1])
+}
+
+/// `[parts^2, N]`: sums of maps `[N, M, H, W]` over each part.
+fn sum_by_part(maps: &Tensor, parts: i64) -> Result<Tensor, TchError> {
+    by_part(maps, parts)?.f_sum_dim_intlist([2_i64].as_slice(), false, None)
 }
 
 /// The shift at which correlations `[.., K]` are highest, `[.., 2]`, as a mean weighted by
@@ -86,6 +165,7 @@ mod tests {
     use tch::Device;
 
     use super::*;
+    use crate::test_data::uniform;
 
     #[test]
     fn a_moved_map_fits_where_it_was_moved_from() {
@@ -105,6 +185,19 @@ mod tests {
         // Part 5 lies inside, where nothing wraps around the edges.
         assert!(near(&parts, &[5, 0]), "{parts}");
         assert!(found.parts.abs().max().double_value(&[]) < 1.5);
+    }
+
+    #[test]
+    fn numbers_and_tensors_find_the_same() {
+        let (ego, others) = (uniform(1, &[1, 3, 16, 24]), uniform(2, &[2, 3, 16, 24]) - 0.4);
+        for parts in [1, PARTS] {
+            let shifted = Shifted::new(&ego, 2, parts).unwrap();
+            let numbers = shifted.correlate(&others).unwrap();
+            let tensors = shifted.correlate(&others.copy().set_requires_grad(true)).unwrap();
+            assert_eq!(numbers.parts.size(), [parts * parts, 2, 25]);
+            assert!(numbers.parts.allclose(&tensors.parts, 1e-5, 1e-6, false));
+            assert!(numbers.whole.allclose(&tensors.whole, 1e-5, 1e-6, false));
+        }
     }
 
     #[test]

@@ -22,6 +22,7 @@ use super::config::PastatConfig;
 use super::extensions::alignment_search::AlignmentSearch;
 use super::extensions::pooled_history::pooled;
 use super::patches::PatchTokens;
+use crate::full_resolution::FullResolutionMap;
 use crate::warp::WarpedMaps;
 
 /// Feature Spatial Alignment.
@@ -146,5 +147,6 @@ fn moved_maps(coarse: &CoarseMaps, deltas: &Tensor, area: &Area, grid: &BevGrid)
     let own = Area::new(grid, [i64::from(grid.height), i64::from(grid.width)], area.radius());
     let (deltas, poses) = (deltas.f_narrow(0, 0, count)?, &coarse.origins.ego_from_cav[1..=count as usize]);
     let places = own_sampling_grid(&deltas, poses, [area, &own])?;
-    NeighbourMaps::at(coarse.received.only(1, count + 1)?, places)
+    let cells = coarse.received_cells.iter().skip(1).map(FullResolutionMap::shallow_clone).collect();
+    NeighbourMaps::at(coarse.received.only(1, count + 1)?, cells, places)
 }

@@ -3,14 +3,17 @@
 use tch::{TchError, Tensor};
 
 use super::area::resample;
-use crate::f64_tensor::{self, are_numbers};
-use crate::warp::{Cells, WarpedMaps};
+use crate::f64_tensor::{self, are_numbers, numbers};
+use crate::full_resolution::FullResolutionMap;
+use crate::warp::WarpedMaps;
 
 /// Maps on the ego's grid. Maps with corrected poses are resampled from the maps as received: a second resampling would
 /// blur them, and cells that a wrong pose has put beyond the ego's edges would be lost. Where no gradient flows this is
 /// done when the maximum over them is taken, once and cell by cell.
 pub(crate) struct NeighbourMaps {
     maps: WarpedMaps,
+    /// The same in plain floats; only with `places`.
+    cells: Vec<FullResolutionMap>,
     /// `[M, H, W, 2]`: positions of the ego's cells on the maps, for `grid_sampler`; absent: maps are aligned already.
     places: Option<Tensor>,
 }
@@ -18,7 +21,7 @@ pub(crate) struct NeighbourMaps {
 impl NeighbourMaps {
     /// Of maps that are aligned already.
     pub(crate) fn still(maps: WarpedMaps) -> Self {
-        Self { maps, places: None }
+        Self { maps, cells: Vec::new(), places: None }
     }
 
     /// Number of maps.
@@ -33,10 +36,10 @@ impl NeighbourMaps {
         &self.maps
     }
 
-    /// Of maps as received, to be sampled at `places`.
-    pub(crate) fn at(maps: WarpedMaps, places: Tensor) -> Result<Self, TchError> {
-        if are_numbers(&maps.features) && are_numbers(&places) {
-            return Ok(Self { maps, places: Some(places) });
+    /// Of maps as received, to be sampled at `places`; `cells` are the same in plain floats, where there are such.
+    pub(crate) fn at(maps: WarpedMaps, cells: Vec<FullResolutionMap>, places: Tensor) -> Result<Self, TchError> {
+        if cells.len() as i64 == maps.count()? && are_numbers(&places) {
+            return Ok(Self { maps, cells, places: Some(places) });
         }
         let (features, mask) = resample(&maps.features, &maps.mask, &places)?;
         Ok(Self::still(WarpedMaps { features, mask }))
@@ -47,8 +50,11 @@ impl NeighbourMaps {
     pub(crate) fn maximum_with(&self, own: &Tensor, weight: &Tensor) -> Result<Tensor, TchError> {
         if let Some(places) = &self.places {
             let mut maximum = f64_tensor::cells(own)?;
-            for map in 0..self.count()? {
-                self.raise(&mut maximum, map, [places, weight])?;
+            for (map, cells) in (0..).zip(&self.cells) {
+                let [places, shares] = [places, weight].map(|tensor| numbers(&tensor.f_get(map)?));
+                if let FullResolutionMap::Numbers { cells, sent } = cells {
+                    cells.raise(&mut maximum, [sent, &places?, &shares?]);
+                }
             }
             let (channels, height, width) = own.size3()?;
             return Tensor::f_from_slice(&maximum)?.f_view([1, height, width, channels])?.f_permute([0, 3, 1, 2]);
@@ -62,13 +68,6 @@ impl NeighbourMaps {
             maximum = maximum.f_maximum(&reach?.f_addcmul(&map?, &weight?)?)?;
         }
         f64_tensor::by_cell(&maximum)
-    }
-
-    /// Raises `maximum` `[H * W, C]` to the values of a map at `places`, times `shares` `[M, 1, H, W]`.
-    fn raise(&self, maximum: &mut [f32], map: i64, [places, shares]: [&Tensor; 2]) -> Result<(), TchError> {
-        let of = |tensor: &Tensor| tensor.f_get(map);
-        let [valid, shares] = [&self.maps.mask, shares].map(|tensor| of(tensor)?.f_squeeze_dim(0));
-        Cells::of(&of(&self.maps.features)?)?.raise(maximum, [&valid?, &of(places)?, &shares?])
     }
 }
 
@@ -93,7 +92,10 @@ mod tests {
         let (own, weight) = (uniform(6, &[3, 16, 32]) - 0.5, uniform(7, &[2, 1, 16, 32]) * 2.0);
         let found = |with_gradient| {
             let maps = WarpedMaps { features: features.shallow_clone(), mask: mask.shallow_clone() };
-            let moved = NeighbourMaps::at(maps, places.copy().set_requires_grad(with_gradient)).unwrap();
+            let cells =
+                |map| FullResolutionMap::of(&features.narrow(0, map, 1), Some(&mask.narrow(0, map, 1))).unwrap();
+            let cells = (0..2).map(cells).collect();
+            let moved = NeighbourMaps::at(maps, cells, places.copy().set_requires_grad(with_gradient)).unwrap();
             assert_eq!(moved.places.is_none(), with_gradient);
             moved.maximum_with(&own, &weight).unwrap()
         };

@@ -164,10 +164,15 @@ impl WindowAttention {
                 .f_reshape([entries * down * across, self.heads, edge * edge, each])
         };
         let [query, key, value] = [windows(&parts[0])?, windows(&parts[1])?, windows(&parts[2])?];
-        let scores = (query / (each as f64).sqrt()).f_matmul(&key.f_transpose(2, 3)?)? + self.preference(size)?;
-        let hidden = valid.f_eq(0.0)?.f_view([entries, down, edge, across, edge])?.f_permute([0, 1, 3, 2, 4])?;
-        let hidden = hidden.f_reshape([entries * down * across, 1, 1, edge * edge])?;
-        let weights = scores.f_masked_fill(&hidden, MASKED)?.f_softmax(3, None)?;
+        let mut scores = (query / (each as f64).sqrt()).f_matmul(&key.f_transpose(2, 3)?)?;
+        scores = scores.f_add_(&self.preference(size)?)?;
+        let hidden = valid.f_eq(0.0)?;
+        if hidden.f_any()?.f_int64_value(&[])? != 0 {
+            let hidden = hidden.f_view([entries, down, edge, across, edge])?.f_permute([0, 1, 3, 2, 4])?;
+            let hidden = hidden.f_reshape([entries * down * across, 1, 1, edge * edge])?;
+            scores = scores.f_masked_fill(&hidden, MASKED)?;
+        }
+        let weights = scores.f_softmax(3, None)?;
         weights
             .f_matmul(&value)?
             .f_view([entries, down, across, self.heads, edge, edge, each].as_slice())?
@@ -179,7 +184,7 @@ impl WindowAttention {
     fn preference(&self, size: &WindowSize) -> Result<Tensor, TchError> {
         let tokens = size.edge * size.edge;
         let places = Tensor::f_from_slice(&size.places)?.f_to_device(size.bias.device())?;
-        size.bias.f_index_select(0, &places)?.f_view([tokens, tokens, self.heads])?.f_permute([2, 0, 1])
+        size.bias.f_index_select(0, &places)?.f_view([tokens, tokens, self.heads])?.f_permute([2, 0, 1])?.f_contiguous()
     }
 }
 

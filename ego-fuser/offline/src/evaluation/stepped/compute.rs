@@ -4,6 +4,7 @@ use std::time::{Duration, Instant};
 
 use agent::agent::AgentInput;
 use dataset::{LoadOptions, Scenario};
+use ego_fuser::ego::View;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use support::nanos;
@@ -15,6 +16,8 @@ use super::super::{EvaluateError, Evaluator, view};
 const MEASURED_TICKS: usize = 5;
 /// Vehicles that they are measured with: the ego and a neighbour.
 const MEASURED_VEHICLES: usize = 2;
+/// Fewest ticks of an estimate: the first one does not count, as every network allocates its memory in it.
+const ESTIMATED_TICKS: usize = 2;
 
 /// Compute time of each step, milliseconds: the same for all vehicles and ticks.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -71,14 +74,53 @@ impl Evaluator {
     /// # Errors
     /// [`EvaluateError`] when a frame cannot be read or computed.
     pub fn measure(&mut self, scenario: &Scenario) -> Result<ComputeTimes, EvaluateError> {
+        let samples = self.samples(scenario, MEASURED_VEHICLES, &|ticks| ticks < MEASURED_TICKS)?;
+        let median = |sample: &[f64]| median(sample).unwrap_or(0.0).ceil();
+        let [pose_ms, map_ms, fuse_ms] = samples.each_ref().map(|sample| median(sample));
+        Ok(ComputeTimes { pose_ms, map_ms, fuse_ms })
+    }
+
+    /// Estimates the compute times of a fleet of `vehicles` on this machine from as many ticks as `budget` allows:
+    /// medians without the first tick. Only two vehicles are computed; the ego fuses the message of the neighbour as
+    /// often as there are neighbours.
+    ///
+    /// # Errors
+    /// [`EvaluateError`] when a frame cannot be read or computed.
+    pub fn estimate(
+        &mut self,
+        scenario: &Scenario,
+        vehicles: usize,
+        budget: Duration,
+    ) -> Result<ComputeTimes, EvaluateError> {
+        let began = Instant::now();
+        let goes_on = |ticks| ticks < ESTIMATED_TICKS || (ticks < MEASURED_TICKS && began.elapsed() < budget);
+        let samples = self.samples(scenario, vehicles, &goes_on)?;
+        let warm = |per_tick: usize, sample: &[f64]| {
+            let warm = sample.get(per_tick..).filter(|warm| !warm.is_empty()).unwrap_or(sample);
+            median(warm).unwrap_or(0.0)
+        };
+        let agents = vehicles.min(MEASURED_VEHICLES);
+        let [pose, map, fuse] = samples;
+        Ok(ComputeTimes { pose_ms: warm(agents, &pose), map_ms: warm(agents, &map), fuse_ms: warm(1, &fuse) })
+    }
+
+    /// Durations of pose, map and fusion while `goes_on` with the number of ticks so far, milliseconds.
+    fn samples(
+        &mut self,
+        scenario: &Scenario,
+        vehicles: usize,
+        goes_on: &dyn Fn(usize) -> bool,
+    ) -> Result<[Vec<f64>; 3], EvaluateError> {
         let exchange = self.ego.method().own_content();
-        let vehicles = scenario.agents.iter().take(MEASURED_VEHICLES);
-        let mut participants = vehicles
+        let mut participants = scenario
+            .agents
+            .iter()
+            .take(MEASURED_VEHICLES)
             .map(|cav| self.participant(scenario, cav, true, None))
             .collect::<Result<Vec<_>, EvaluateError>>()?;
         let [mut pose, mut map, mut fuse] = [const { Vec::<f64>::new() }; 3];
         self.ego.forget();
-        for tick in 0..scenario.ticks.len().min(MEASURED_TICKS) {
+        for tick in (0..scenario.ticks.len()).take_while(|tick| goes_on(*tick)) {
             let mut sent = Vec::with_capacity(participants.len());
             for (place, participant) in participants.iter_mut().enumerate() {
                 if !scenario.is_present(place, tick) {
@@ -98,6 +140,11 @@ impl Evaluator {
                 pose.push(ms(pose_time));
                 map.push(ms(began.elapsed().saturating_sub(2 * pose_time)));
             }
+            let others = scenario.agents.iter().take(vehicles).skip(sent.len());
+            let copies =
+                sent.get(1).map(|neighbour: &View| others.map(|cav| View { cav: cav.clone(), ..neighbour.clone() }));
+            let copies: Vec<View> = copies.into_iter().flatten().collect();
+            sent.extend(copies);
             let began = Instant::now();
             if let [own, neighbours @ ..] = &sent[..] {
                 self.ego.detect(own, neighbours)?;
@@ -105,8 +152,7 @@ impl Evaluator {
             fuse.push(ms(began.elapsed()));
         }
         self.ego.forget();
-        let median = |sample: &[f64]| median(sample).unwrap_or(0.0).ceil();
-        Ok(ComputeTimes { pose_ms: median(&pose), map_ms: median(&map), fuse_ms: median(&fuse) })
+        Ok([pose, map, fuse])
     }
 }
 

@@ -26,6 +26,8 @@ use crate::pastat::spatial_alignment::area::moved;
 /// FSA compares earlier maps with larger cells than the newest, so the correction of a well-placed one errs by a few
 /// tenths of a metre. A correction within this distance of that of its agent's newest map is replaced by the latter.
 const SAME_PLACE_M: f64 = 0.6;
+/// `embedding_bag` adds rows.
+const SUM: i64 = 0;
 
 /// Maps from before their agents' newest.
 struct Earlier<'a> {
@@ -186,8 +188,8 @@ struct Places {
     cells: Tensor,
     /// `[R]`, of these cells and their neighbours.
     near: Tensor,
-    /// `[P, 9]`: for each cell the indices in `near` of the 3x3 cells around it.
-    around: Tensor,
+    /// For each cell the 3x3 cells of `near` around it.
+    around: Around,
     /// `[P]`: for each cell its own index in `near`.
     middle: Tensor,
 }
@@ -202,20 +204,47 @@ impl Places {
             cells: index(&selection.cells)?,
             near: index(&near)?,
             middle: around.f_select(1, AROUND / 2)?,
-            around,
+            around: Around::of(&around)?,
         })
     }
 }
 
-/// A 3x3 convolution at some cells, in the fastest precision: `[P, hidden]` of the cells' features `[R, C]`, given the
-/// indices `[P, 9]` `around` each; the index after the last is beyond the edge.
-fn beside(convolution: &nn::Conv2D, shown: &Tensor, around: &Tensor) -> Result<Tensor, TchError> {
-    let channels = shown.size2()?.1;
-    let kind = fastest_of(shown);
-    let shown = shown.f_to_kind(kind)?.f_constant_pad_nd([0, 0, 0, 1])?.f_index_select(0, &around.f_reshape(-1)?)?;
-    let weight = convolution.ws.f_permute([0, 2, 3, 1])?.f_flatten(1, 3)?.f_to_kind(kind)?;
-    let bias = convolution.bs.as_ref().map(|bias| bias.f_to_kind(kind)).transpose()?;
-    shown.f_view([-1, AROUND * channels])?.f_linear(&weight, bias.as_ref())?.f_to_kind(Kind::Float)
+/// The results of a convolution's nine weights that each of some cells needs.
+struct Around {
+    /// `[P * 9]`: rows of all results, nine for each cell that is shown.
+    results: Tensor,
+    /// `[P]`: where those of each cell begin.
+    first: Tensor,
+}
+
+impl Around {
+    /// Given the indices `[P, 9]` of the cells around each among those that are shown; the index after the last is
+    /// beyond the edge.
+    fn of(around: &Tensor) -> Result<Self, TchError> {
+        let options = (Kind::Int64, around.device());
+        let results = (around * AROUND + Tensor::f_arange(AROUND, options)?).f_flatten(0, 1)?;
+        Ok(Self { first: Tensor::f_arange(around.size2()?.0, options)? * AROUND, results })
+    }
+}
+
+/// A 3x3 convolution at some cells, in the fastest precision: `[P, hidden]` of the features `[R, C]` that are shown.
+///
+/// Each cell is multiplied with all nine weights first: the nine results that a cell needs are fewer numbers than the
+/// features of nine cells.
+fn beside(
+    convolution: &nn::Conv2D,
+    shown: &Tensor,
+    Around { results: rows, first }: &Around,
+) -> Result<Tensor, TchError> {
+    let (hidden, kind) = (convolution.ws.size4()?.0, fastest_of(shown));
+    let weight = convolution.ws.f_permute([2, 3, 0, 1])?.f_flatten(0, 2)?.f_to_kind(kind)?;
+    let shown = shown.f_to_kind(kind)?.f_constant_pad_nd([0, 0, 0, 1])?;
+    let results = shown.f_linear(&weight, None::<&Tensor>)?.f_to_kind(Kind::Float)?.f_view([-1, hidden])?;
+    let (sums, ..) = Tensor::f_embedding_bag(&results, rows, first, false, SUM, false, None::<&Tensor>, false)?;
+    match &convolution.bs {
+        Some(bias) => sums.f_add(bias),
+        None => Ok(sums),
+    }
 }
 
 #[cfg(test)]
@@ -238,7 +267,8 @@ mod tests {
         let of = |places: &[i64]| Tensor::from_slice(places);
         let near: Vec<i64> = selection.near.iter().map(|[row, column]| (row * 6 + column) as i64).collect();
         let shown = map.flatten(2, 3).squeeze_dim(0).transpose(0, 1).index_select(0, &of(&near));
-        let some = beside(&convolution, &shown, &of(&selection.around).view([-1, AROUND])).unwrap();
+        let some =
+            beside(&convolution, &shown, &Around::of(&of(&selection.around).view([-1, AROUND])).unwrap()).unwrap();
         assert!(some.allclose(&all.index_select(0, &of(&selection.cells)), 1e-2, 1e-2, false));
     }
 

@@ -1,0 +1,196 @@
+//! Capacity: estimate of the pace of a live run on this machine, from a few frames of its scene, and what would help
+//! where it does not keep up.
+
+use std::fmt;
+use std::time::Duration;
+
+use ego_fuser_offline::evaluation::Evaluator;
+use ego_fuser_offline::evaluation::stepped::ComputeTimes;
+use fusion::{Exchange, Method};
+use serde::{Deserialize, Serialize};
+
+use crate::operate::RunError;
+use crate::operate::fleet::Fleet;
+use crate::run::loss::listed;
+use crate::run::machine::{Machine, speed_of_many};
+use crate::run::stepped::{evaluate_config, recorded};
+
+/// Time for computing frames; loading the models comes on top.
+const BUDGET: Duration = Duration::from_millis(600);
+/// CPU time of replay, transport, encoding, router and scorer, as a share of that of the networks: measured over the
+/// methods of the demo.
+const OVERHEAD: f64 = 0.2;
+/// Share of the ticks from which a run counts as keeping up.
+const KEEPS_UP: f64 = 0.99;
+
+/// Estimate of the pace of a live run.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Capacity {
+    /// The machine.
+    pub machine: Machine,
+    /// Fusion method.
+    pub method: String,
+    /// Number of vehicles.
+    pub vehicles: usize,
+    /// Number of these whose agents run on this machine.
+    pub local_vehicles: usize,
+    /// CPU time of an agent per frame, milliseconds.
+    pub agent_ms: f64,
+    /// CPU time of the fusion per frame, milliseconds.
+    pub fuse_ms: f64,
+    /// Time between two frames, milliseconds.
+    pub period_ms: f64,
+    /// Speed of a core while others compute too, relative to one alone, 0..=1.
+    pub shared_speed: f64,
+    /// CPU time per frame of all processes on this machine, milliseconds.
+    pub needed_ms: f64,
+    /// CPU time that the cores give per frame, milliseconds of a core that computes alone.
+    pub available_ms: f64,
+    /// Expected share of answered frames, 0..=1.
+    pub expected_share: f64,
+}
+
+impl Capacity {
+    /// Estimates the pace of a fleet. `None` for a run without a pace of its own: in lockstep, as fast as possible, or
+    /// of a single tick.
+    ///
+    /// # Errors
+    /// [`RunError`] when models or frames cannot be loaded or computed.
+    pub fn estimate(fleet: &Fleet) -> Result<Option<Self>, RunError> {
+        let scene = &fleet.scenario.scene;
+        let recorded = recorded(fleet)?;
+        let steps = recorded.ticks.windows(2).map(|pair| pair[1].capture_nanos.saturating_sub(pair[0].capture_nanos));
+        let Some(period_nanos) = steps.min().filter(|_| !scene.lockstep && scene.rate > 0.0) else { return Ok(None) };
+        let period_ms = period_nanos as f64 * 1e-6 / scene.rate;
+        fleet.scenario.models.threads.apply();
+        let vehicles = fleet.agents.len();
+        let times = Evaluator::new(evaluate_config(fleet))?.estimate(&recorded, vehicles, BUDGET)?;
+        let machine = Machine::here();
+        let threads = machine.cores.min(vehicles + 1);
+        let shared_speed = if threads > 1 { speed_of_many(threads) } else { 1.0 };
+        let remote = fleet.scenario.remote_agents.len();
+        let method = fleet.scenario.method.name();
+        Ok(Some(Self::of(
+            machine,
+            (method, vehicles, vehicles - remote.min(vehicles)),
+            &times,
+            period_ms,
+            shared_speed,
+        )))
+    }
+
+    fn of(
+        machine: Machine,
+        (method, vehicles, local_vehicles): (&str, usize, usize),
+        times: &ComputeTimes,
+        period_ms: f64,
+        shared_speed: f64,
+    ) -> Self {
+        let (agent_ms, fuse_ms) = (times.pose_ms + times.map_ms, times.fuse_ms);
+        let needed_ms = (1.0 + OVERHEAD) * (local_vehicles as f64 * agent_ms + fuse_ms);
+        let available_ms = machine.cores as f64 * shared_speed * period_ms;
+        // Neither an agent nor the ego computes two frames at once.
+        let longest_ms = agent_ms.max(fuse_ms) / shared_speed;
+        let expected_share = (available_ms / needed_ms).min(period_ms / longest_ms).min(1.0);
+        let method = method.to_owned();
+        Self {
+            machine,
+            method,
+            vehicles,
+            local_vehicles,
+            agent_ms,
+            fuse_ms,
+            period_ms,
+            shared_speed,
+            needed_ms,
+            available_ms,
+            expected_share,
+        }
+    }
+
+    /// True if all frames are expected to be answered.
+    #[must_use]
+    pub fn keeps_up(&self) -> bool {
+        self.expected_share >= KEEPS_UP
+    }
+
+    /// Replay rate at which the machine is expected to keep up, relative to the current one: a multiple of 0.05 below
+    /// the expected share.
+    fn relative_rate(&self) -> f64 {
+        ((self.expected_share * 20.0 * 0.95).floor() / 20.0).max(0.05)
+    }
+}
+
+impl fmt::Display for Capacity {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { machine: Machine { cores, instructions }, method, vehicles, needed_ms, available_ms, .. } = self;
+        let plural = |count: usize| if count == 1 { "" } else { "s" };
+        write!(
+            f,
+            "{cores} core{}, {instructions}; {method} with {vehicles} vehicle{} needs about {needed_ms:.0} ms of CPU per \
+             frame of {available_ms:.0} available: expect about {} of 10 frames answered",
+            plural(*cores),
+            plural(*vehicles),
+            (10.0 * self.expected_share).round()
+        )
+    }
+}
+
+/// Changes that let a fleet answer more ticks, the mildest first, as text: `tracked poses, method max or clock: stepped`.
+#[must_use]
+pub fn remedies(fleet: &Fleet, capacity: Option<&Capacity>) -> String {
+    let scenario = &fleet.scenario;
+    let mut all = Vec::new();
+    if fleet.pose_source() == "pgc" {
+        all.push("tracked poses (agents.pose.tracked)".to_owned());
+    }
+    if scenario.method.exchange() == Exchange::Features && scenario.method != Method::MAX {
+        all.push("method max".to_owned());
+    }
+    if fleet.agents.len() > 2 {
+        all.push("fewer vehicles (scene.agents)".to_owned());
+    }
+    let relative = capacity.map_or(0.5, Capacity::relative_rate);
+    all.push(format!("--rate {}", rounded(relative * scenario.scene.rate)));
+    // Simulation time refuses processes that are slower than the scene.
+    let fits = capacity.is_none_or(|capacity| capacity.agent_ms.max(capacity.fuse_ms) < 0.9 * capacity.period_ms);
+    all.push(if fits { "clock: stepped" } else { "scene.lockstep: true" }.to_owned());
+    listed(&all, "or")
+}
+
+/// A rate with at most two significant digits after the point.
+fn rounded(rate: f64) -> f64 {
+    (rate * 100.0).round() / 100.0
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn capacity(cores: usize, pose_ms: f64, fuse_ms: f64, shared_speed: f64) -> Capacity {
+        let machine = Machine { cores, instructions: "AVX2".into() };
+        let times = ComputeTimes { pose_ms, map_ms: 40.0, fuse_ms };
+        Capacity::of(machine, ("pastat", 2, 2), &times, 100.0, shared_speed)
+    }
+
+    #[test]
+    fn a_machine_with_time_to_spare_keeps_up() {
+        let capacity = capacity(4, 20.0, 40.0, 1.0);
+        assert!(capacity.keeps_up() && (capacity.needed_ms, capacity.available_ms) == (192.0, 400.0), "{capacity:?}");
+        let text = capacity.to_string();
+        assert!(text.contains("4 cores, AVX2; pastat with 2 vehicles needs about 192 ms"), "{text}");
+        assert!(text.ends_with("expect about 10 of 10 frames answered"), "{text}");
+    }
+
+    #[test]
+    fn all_cores_together_and_each_process_alone_limit_the_pace() {
+        // 1.2 x (2 x 100 + 100) ms in 2 x 100 ms.
+        let together = capacity(2, 60.0, 100.0, 1.0);
+        assert!((together.expected_share - 200.0 / 360.0).abs() < 1e-9 && !together.keeps_up());
+        assert!((together.relative_rate() - 0.5).abs() < 1e-9);
+        // Hyperthreads of one core.
+        assert!((capacity(2, 60.0, 100.0, 0.6).expected_share - 120.0 / 360.0).abs() < 1e-9);
+        // Many cores do not help an agent that needs 160 ms for a sweep.
+        assert!((capacity(16, 120.0, 50.0, 1.0).expected_share - 100.0 / 160.0).abs() < 1e-9);
+    }
+}

@@ -1,0 +1,96 @@
+//! Pace: share of the ticks that every agent computed and that the ego answered, and intervals between detections.
+
+use std::collections::BTreeMap;
+
+use protocol::{ProcessId, Role};
+use serde::{Deserialize, Serialize};
+
+use super::Spread;
+use crate::score::metrics::Metrics;
+use crate::score::{FrameRecord, ProcessStats};
+
+/// Stage that an agent times once for every sweep that it computes in full.
+const WHOLE_SWEEP: &str = "agent";
+
+/// Pace of a run.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct Pace {
+    /// Number of ticks of the scene.
+    pub ticks: u64,
+    /// Number of ticks with detections.
+    pub answered: u64,
+    /// Sweeps that each agent computed, by vehicle; empty in simulation time, where all are.
+    pub agents: BTreeMap<String, AgentPace>,
+    /// Between the publications of two detections that follow each other, milliseconds.
+    pub interval_ms: Spread,
+    /// Detections per second, from the first to the last.
+    pub rate_hz: Option<f64>,
+    /// From the first tick to the last publication, seconds.
+    pub seconds: f64,
+}
+
+/// Sweeps of one agent.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+pub struct AgentPace {
+    /// Number of sweeps computed, over all instances of the process.
+    pub computed: u64,
+    /// Share of the ticks, 0..=1.
+    pub share: f64,
+}
+
+impl Pace {
+    pub(super) fn of(metrics: &Metrics, records: &[FrameRecord], processes: &[ProcessStats]) -> Self {
+        let mut published_s: Vec<f64> = records.iter().filter_map(published_s).collect();
+        published_s.sort_by(f64::total_cmp);
+        let intervals_ms: Vec<f64> = published_s.windows(2).map(|pair| (pair[1] - pair[0]) * 1e3).collect();
+        let ticks_s = || records.iter().map(began_s);
+        let first_s = ticks_s().reduce(f64::min);
+        let last_s = ticks_s().chain(published_s.iter().copied()).reduce(f64::max);
+        let span_s = published_s.first().zip(published_s.last()).map(|(first, last)| last - first);
+        Self {
+            ticks: metrics.ticks,
+            answered: metrics.answered,
+            agents: agents(processes, metrics.ticks),
+            interval_ms: Spread::of(&intervals_ms),
+            rate_hz: span_s.filter(|span| *span > 0.0).map(|span| intervals_ms.len() as f64 / span),
+            seconds: first_s.zip(last_s).map_or(0.0, |(first, last)| last - first),
+        }
+    }
+
+    /// Share of answered ticks, 0..=1; `None` without ticks.
+    #[must_use]
+    pub fn answered_share(&self) -> Option<f64> {
+        (self.ticks > 0).then(|| self.answered as f64 / self.ticks as f64)
+    }
+}
+
+/// Time of publication of a tick; in simulation time its capture, seconds.
+fn began_s(record: &FrameRecord) -> f64 {
+    record.stamps.began_nanos.unwrap_or(record.capture_nanos) as f64 * 1e-9
+}
+
+/// Time of publication of its detections, seconds.
+fn published_s(record: &FrameRecord) -> Option<f64> {
+    Some(began_s(record) + record.latency_ms? * 1e-3)
+}
+
+fn agents(processes: &[ProcessStats], ticks: u64) -> BTreeMap<String, AgentPace> {
+    let mut agents = BTreeMap::<String, AgentPace>::new();
+    for stats in processes {
+        let Some(cav) = vehicle_of(&stats.process) else { continue };
+        let pace = agents.entry(cav.to_owned()).or_default();
+        pace.computed += sweeps(stats);
+        pace.share = if ticks == 0 { 0.0 } else { pace.computed as f64 / ticks as f64 };
+    }
+    agents
+}
+
+/// Vehicle of an agent's process.
+fn vehicle_of(process: &ProcessId) -> Option<&str> {
+    process.as_str().strip_prefix(Role::Agent.as_str())?.strip_prefix('-')
+}
+
+/// Number of sweeps that an agent has computed.
+pub(super) fn sweeps(stats: &ProcessStats) -> u64 {
+    stats.stages.iter().find(|stage| stage.stage == WHOLE_SWEEP).map_or(0, |stage| stage.count)
+}

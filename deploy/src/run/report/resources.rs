@@ -1,0 +1,151 @@
+//! Stages, CPU time, memory and bytes of the processes of a run.
+
+use std::collections::BTreeMap;
+
+use protocol::{Role, Topic};
+use serde::{Deserialize, Serialize};
+
+use super::Pace;
+use super::pace::sweeps;
+use crate::score::ProcessStats;
+
+/// Durations of one stage in the processes of one kind. Of several processes those of the slowest, for which the ego
+/// waits.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct StageTimes {
+    /// Kind of process: its role.
+    pub kind: String,
+    /// Number of processes with this stage.
+    pub processes: usize,
+    /// Name of the stage.
+    pub stage: String,
+    /// Number of frames, over all processes.
+    pub count: u64,
+    /// Median, milliseconds.
+    pub p50_ms: f64,
+    /// 95th percentile, milliseconds.
+    pub p95_ms: f64,
+    /// Maximum, milliseconds.
+    pub max_ms: f64,
+}
+
+/// CPU time and memory of a process, over all its instances.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ProcessResources {
+    /// Name of the process. `scorer` is `v2vloc` itself, with the router of the run.
+    pub process: String,
+    /// Number of instances: 1, and one for each restart.
+    pub instances: usize,
+    /// CPU time in total, seconds.
+    pub cpu_s: f64,
+    /// CPU time from the first tick on, seconds.
+    pub playing_cpu_s: f64,
+    /// Mean number of cores in use from the first tick to the last detections.
+    pub cores: Option<f64>,
+    /// CPU time from the first tick on, per frame: of an agent per computed sweep, of an ego per result, of others per
+    /// tick, milliseconds.
+    pub cpu_ms_per_frame: Option<f64>,
+    /// Largest resident memory of an instance, bytes.
+    pub peak_resident_bytes: u64,
+}
+
+/// Published messages of one stream, over all vehicles.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct StreamBytes {
+    /// Name of the stream; those behind the link emulation as `rx/STREAM`.
+    pub stream: String,
+    /// Number of messages, each counted once for all its receivers.
+    pub messages: u64,
+    /// Bytes of header, metadata and body.
+    pub bytes: u64,
+}
+
+/// Stages by kind of process, in the order of the data flow, then of their names.
+pub(super) fn stages(processes: &[ProcessStats]) -> Vec<StageTimes> {
+    let mut all = BTreeMap::<(usize, String, String), StageTimes>::new();
+    for stats in processes {
+        let (order, kind) = kind_of(stats.process.as_str());
+        for stage in &stats.stages {
+            let times = all.entry((order, kind.clone(), stage.stage.clone())).or_insert_with(|| StageTimes {
+                kind: kind.clone(),
+                processes: 0,
+                stage: stage.stage.clone(),
+                count: 0,
+                p50_ms: 0.0,
+                p95_ms: 0.0,
+                max_ms: 0.0,
+            });
+            times.processes += 1;
+            times.count += stage.count;
+            times.p50_ms = times.p50_ms.max(stage.p50_ms);
+            times.p95_ms = times.p95_ms.max(stage.p95_ms);
+            times.max_ms = times.max_ms.max(stage.max_ms);
+        }
+    }
+    all.into_values().collect()
+}
+
+/// Kind of a process, and its place in the data flow.
+fn kind_of(process: &str) -> (usize, String) {
+    const ORDER: [Role; 5] = [Role::Replay, Role::Agent, Role::Link, Role::Ego, Role::Scorer];
+    let is_of = |role: Role| process.split('-').next() == Some(role.as_str());
+    match ORDER.into_iter().position(is_of) {
+        Some(place) => (place, ORDER[place].to_string()),
+        None => (ORDER.len(), process.to_owned()),
+    }
+}
+
+/// CPU time and memory of every process, in the order of the data flow.
+pub(super) fn processes(processes: &[ProcessStats], pace: &Pace) -> Vec<ProcessResources> {
+    let mut all = BTreeMap::<(usize, String), (ProcessResources, u64)>::new();
+    for stats in processes {
+        let name = stats.process.to_string();
+        let (order, kind) = kind_of(&name);
+        let (sum, frames) = all.entry((order, name.clone())).or_insert_with(|| (nothing_of(name), 0));
+        sum.instances += 1;
+        sum.cpu_s += stats.usage.cpu_s;
+        sum.playing_cpu_s += (stats.usage.cpu_s - stats.cpu_before_s).max(0.0);
+        sum.peak_resident_bytes = sum.peak_resident_bytes.max(stats.usage.peak_resident_bytes);
+        *frames = match kind.as_str() {
+            "agent" => *frames + sweeps(stats),
+            "ego" => pace.answered,
+            _ => pace.ticks,
+        };
+    }
+    let finished = |(sum, frames): (ProcessResources, u64)| ProcessResources {
+        cores: (pace.seconds > 0.0).then(|| sum.playing_cpu_s / pace.seconds),
+        cpu_ms_per_frame: (frames > 0).then(|| sum.playing_cpu_s * 1e3 / frames as f64),
+        ..sum
+    };
+    all.into_values().map(finished).collect()
+}
+
+fn nothing_of(process: String) -> ProcessResources {
+    ProcessResources {
+        process,
+        instances: 0,
+        cpu_s: 0.0,
+        playing_cpu_s: 0.0,
+        cores: None,
+        cpu_ms_per_frame: None,
+        peak_resident_bytes: 0,
+    }
+}
+
+/// Published bytes by stream, the largest first.
+pub(super) fn streams(processes: &[ProcessStats]) -> Vec<StreamBytes> {
+    let mut sums = BTreeMap::<String, (u64, u64)>::new();
+    for traffic in processes.iter().flat_map(|stats| &stats.traffic) {
+        let stream = match &traffic.topic {
+            Topic::Stream { stream, .. } => stream.to_string(),
+            Topic::Received { stream, .. } => format!("rx/{stream}"),
+            other => other.to_string(),
+        };
+        let (messages, bytes) = sums.entry(stream).or_default();
+        (*messages, *bytes) = (*messages + traffic.messages, bytes.saturating_add(traffic.bytes));
+    }
+    let of = |(stream, (messages, bytes))| StreamBytes { stream, messages, bytes };
+    let mut streams: Vec<StreamBytes> = sums.into_iter().map(of).collect();
+    streams.sort_by(|a, b| b.bytes.cmp(&a.bytes).then_with(|| a.stream.cmp(&b.stream)));
+    streams
+}

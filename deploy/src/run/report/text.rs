@@ -1,0 +1,121 @@
+//! A report as text for a terminal.
+
+use std::fmt;
+
+use support::text_table::{Side, TextTable};
+
+use super::{Pace, RunReport, Spread};
+use crate::operate::progress::bytes;
+
+/// Bytes of a MiB.
+const MIB: f64 = 1_048_576.0;
+
+impl fmt::Display for RunReport {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        if let Some(capacity) = &self.capacity {
+            writeln!(f, "machine   {capacity}")?;
+        }
+        write!(f, "{}", self.pace)?;
+        writeln!(f, "latency   capture to detection: {}", milliseconds(&self.latency_ms))?;
+        for (rows, table) in [
+            (self.stages.len(), self.stage_table()),
+            (self.processes.len(), self.process_table()),
+            (self.streams.len(), self.stream_table()),
+        ] {
+            if rows > 0 {
+                write!(f, "\n{table}")?;
+            }
+        }
+        Ok(())
+    }
+}
+
+impl fmt::Display for Pace {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { ticks, answered, agents, interval_ms, rate_hz, .. } = self;
+        let share = self.answered_share().map_or("-".into(), percent);
+        let rate = rate_hz.map_or(String::new(), |rate| format!(", {rate:.1} detections a second"));
+        writeln!(
+            f,
+            "pace      answered {answered}/{ticks} ({share}){rate}; between detections {}",
+            milliseconds(interval_ms)
+        )?;
+        if !agents.is_empty() {
+            let of = |(cav, pace): (&String, &super::AgentPace)| {
+                format!("{cav} {}/{ticks} ({})", pace.computed, percent(pace.share))
+            };
+            writeln!(f, "computed  {}", agents.iter().map(of).collect::<Vec<_>>().join(", "))?;
+        }
+        Ok(())
+    }
+}
+
+impl RunReport {
+    fn stage_table(&self) -> TextTable {
+        let numbers = ["frames", "median ms", "95th percentile", "longest"].map(|name| (name, Side::Right));
+        let names = ["process", "stage"].map(|name| (name, Side::Left));
+        let mut table = TextTable::new(names.into_iter().chain(numbers));
+        for stage in &self.stages {
+            let kind = match stage.processes {
+                1 => stage.kind.clone(),
+                several => format!("{}, slowest of {several}", stage.kind),
+            };
+            let times = [stage.p50_ms, stage.p95_ms, stage.max_ms].map(|ms| format!("{ms:.1}"));
+            table.row([kind, stage.stage.clone(), stage.count.to_string()].into_iter().chain(times));
+        }
+        table
+    }
+
+    fn process_table(&self) -> TextTable {
+        let numbers = ["CPU s", "of these playing", "cores", "CPU ms per frame", "peak MiB"];
+        let numbers = numbers.map(|name| (name, Side::Right));
+        let mut table = TextTable::new([("process", Side::Left)].into_iter().chain(numbers));
+        for process in &self.processes {
+            let name = match (process.process.as_str(), process.instances) {
+                ("scorer", _) => "v2vloc (router, scorer)".to_owned(),
+                (name, 1) => name.to_owned(),
+                (name, several) => format!("{name}, started {several} times"),
+            };
+            table.row([
+                name,
+                format!("{:.2}", process.cpu_s),
+                format!("{:.2}", process.playing_cpu_s),
+                number(process.cores, 2),
+                number(process.cpu_ms_per_frame, 1),
+                format!("{:.0}", process.peak_resident_bytes as f64 / MIB),
+            ]);
+        }
+        table
+    }
+
+    fn stream_table(&self) -> TextTable {
+        let numbers = ["messages", "bytes", "per message"].map(|name| (name, Side::Right));
+        let mut table = TextTable::new([("stream", Side::Left)].into_iter().chain(numbers));
+        for stream in &self.streams {
+            let mean = stream.bytes as f64 / stream.messages.max(1) as f64;
+            table.row([stream.stream.clone(), stream.messages.to_string(), bytes(stream.bytes as f64), bytes(mean)]);
+        }
+        table
+    }
+}
+
+/// Median, 95th percentile and maximum.
+fn milliseconds(spread: &Spread) -> String {
+    match spread.p50 {
+        None => "-".into(),
+        Some(_) => format!(
+            "median {} ms, 95th percentile {}, longest {}",
+            number(spread.p50, 0),
+            number(spread.p95, 0),
+            number(spread.max, 0)
+        ),
+    }
+}
+
+fn percent(share: f64) -> String {
+    format!("{:.0} %", 100.0 * share)
+}
+
+fn number(value: Option<f64>, digits: usize) -> String {
+    value.map_or("-".into(), |value| format!("{value:.digits$}"))
+}

@@ -1,0 +1,30 @@
+//! `truth.jsonl`: the ground truth of every tick as it was scored, so that all precisions can be computed anew.
+
+use protocol::{Box3d, CavId, Pose};
+use serde::Serialize;
+
+/// One line: the ground truth of a tick for one ego.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct TruthLine {
+    /// Tick of the scene, counted from 0.
+    pub tick: u64,
+    /// Capture time on the scene's clock, nanoseconds.
+    pub capture_nanos: u64,
+    /// Time of publication, Unix nanoseconds; in simulation time the capture time.
+    pub publish_nanos: u64,
+    /// The vehicle whose detections are scored.
+    pub ego: CavId,
+    /// True pose of its LiDAR.
+    pub world_from_ego: Option<Pose>,
+    /// True boxes that count, in its LiDAR frame.
+    pub boxes: Vec<Box3d>,
+}
+
+impl TruthLine {
+    /// The line, without its end.
+    #[must_use]
+    pub fn to_json(&self) -> String {
+        // Numbers, names and lists have a spelling in JSON.
+        serde_json::to_string(self).unwrap_or_default()
+    }
+}

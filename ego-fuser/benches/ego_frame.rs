@@ -1,0 +1,207 @@
+//! Frames of the ego with released weights on a recorded scene: time of each stage, by method and number of vehicles.
+//!
+//! `cargo bench -p ego-fuser --bench ego_frame -- --scene SCENE --weights deploy/weights pastat max`
+//!
+//! Maps pass through the codec as live ones do. Poses err by 0.2 m. Each frame is computed several times, on the same
+//! history; a figure is the mean over the frames of each frame's fastest run. `--boxes FILE` writes what was detected,
+//! so that two versions can be compared.
+
+use std::collections::BTreeMap;
+use std::error::Error;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use agent::agent::{Agent, AgentInput};
+use bus::malloc_settings;
+use clap::Parser;
+use dataset::frame::Frame;
+use dataset::{LoadOptions, Scenario};
+use ego_fuser::ego::{Content, Ego, View};
+use fusion::{Exchange, Method};
+use localization::pose_source::PoseSourceConfig;
+use perception::detector::Detector;
+use protocol::{CodecConfig, EncodedFeatures, Limits, Pose, PoseEstimate};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use support::stage_times::StageTimes;
+
+/// Largest error of a pose along x and y, metres.
+const POSE_ERROR_M: f64 = 0.2;
+/// The same of its heading, radians.
+const HEADING_ERROR_RAD: f64 = 0.004;
+/// Confidence of every pose.
+const CONFIDENCE: f32 = 0.9;
+
+type Failure = Box<dyn Error>;
+
+/// Times frames of the ego.
+#[derive(Debug, Parser)]
+struct Arguments {
+    /// Methods, each with its released weights.
+    methods: Vec<Method>,
+    /// A scenario with as many vehicles as are asked for.
+    #[arg(long)]
+    scene: PathBuf,
+    /// Folder of the released weights.
+    #[arg(long, default_value = "deploy/weights")]
+    weights: PathBuf,
+    /// Numbers of vehicles, the ego included.
+    #[arg(long, num_args = 1.., default_values_t = [2, 3, 4])]
+    vehicles: Vec<usize>,
+    /// Frames, one after another.
+    #[arg(long, default_value_t = 6)]
+    frames: usize,
+    /// Runs over all frames.
+    #[arg(long, default_value_t = 8)]
+    runs: usize,
+    /// Written: detections of the last run.
+    #[arg(long)]
+    boxes: Option<PathBuf>,
+    /// Passed by `cargo bench`.
+    #[arg(long, hide = true)]
+    bench: bool,
+}
+
+/// One vehicle's message of a frame, its map still encoded.
+struct Sent {
+    view: View,
+    features: Option<EncodedFeatures>,
+}
+
+fn main() -> Result<(), Failure> {
+    malloc_settings::ensure(&malloc_settings::KEPT_MEMORY)?;
+    tch::set_num_threads(1);
+    let arguments = Arguments::parse();
+    let scenario = dataset::open(&arguments.scene)?.scenarios.into_iter().next().ok_or("no scenario")?;
+    let mut boxes = String::new();
+    for &method in &arguments.methods {
+        // Boxes and single vehicles have the weights of `none`.
+        let named = arguments.weights.join(format!("lean-{method}.safetensors"));
+        let weights = if named.exists() { named } else { arguments.weights.join("lean-none.safetensors") };
+        for &vehicles in &arguments.vehicles {
+            let frames = sent(&scenario, &weights, method, [vehicles, arguments.frames])?;
+            let mut best: Vec<BTreeMap<String, f64>> = vec![BTreeMap::new(); frames.len()];
+            for run in 0..arguments.runs {
+                let mut ego = Ego::load(&weights, Some(method))?;
+                for (index, (frame, best)) in frames.iter().zip(&mut best).enumerate() {
+                    let found = timed(&mut ego, frame, best)?;
+                    if run + 1 == arguments.runs {
+                        boxes += &format!("{method} {vehicles} {index} {found}\n");
+                    }
+                }
+            }
+            print(method, vehicles, &best);
+        }
+    }
+    if let Some(path) = &arguments.boxes {
+        fs::write(path, boxes)?;
+    }
+    Ok(())
+}
+
+/// Computes one frame and lowers the fastest time of each stage, milliseconds; returns the boxes as text.
+fn timed(ego: &mut Ego, frame: &[Sent], best: &mut BTreeMap<String, f64>) -> Result<String, Failure> {
+    let mut times = StageTimes::start();
+    let views = frame.iter().map(Sent::received).collect::<Result<Vec<View>, Failure>>()?;
+    times.lap("decode");
+    let start = Instant::now();
+    let output = ego.detect(&views[0], &views[1..])?;
+    let whole_ms = start.elapsed().as_secs_f64() * 1e3;
+    let stages = times.into_timings().into_iter().chain(output.stages);
+    let mut all: Vec<(String, f64)> = stages.map(|stage| (stage.stage.clone(), stage.nanos as f64 * 1e-6)).collect();
+    let staged_ms: f64 = all.iter().skip(1).map(|(_, ms)| ms).sum();
+    all.push(("keep".to_owned(), whole_ms - staged_ms));
+    all.push(("whole".to_owned(), whole_ms + all[0].1));
+    for (stage, ms) in all {
+        let least = best.entry(stage).or_insert(f64::INFINITY);
+        *least = least.min(ms);
+    }
+    let text = |found: &protocol::Detection| {
+        let [x, y, _] = found.box3d.center_m;
+        format!("{:.4} {x:.3} {y:.3} {:.4}", found.score, found.box3d.heading_rad)
+    };
+    Ok(output.detections.iter().map(text).collect::<Vec<_>>().join("; "))
+}
+
+impl Sent {
+    /// As the ego's node hands it to the pipeline.
+    fn received(&self) -> Result<View, Failure> {
+        let View { cav, pose, capture_nanos, content } = &self.view;
+        let content = match &self.features {
+            Some(features) => Content::Features(features.clone().decode(&Limits::default())?),
+            None => content.clone(),
+        };
+        Ok(View { cav: cav.clone(), pose: *pose, capture_nanos: *capture_nanos, content })
+    }
+}
+
+/// Messages of all vehicles, frame by frame.
+fn sent(
+    scenario: &Scenario,
+    weights: &Path,
+    method: Method,
+    [vehicles, frames]: [usize; 2],
+) -> Result<Vec<Vec<Sent>>, Failure> {
+    let mut random = ChaCha8Rng::seed_from_u64(vehicles as u64);
+    let mut agents = Vec::new();
+    for cav in scenario.agents.iter().take(vehicles) {
+        let source = PoseSourceConfig::Recorded.for_scenario(&scenario.name).build()?;
+        agents.push(Agent::new(cav.clone(), source, Detector::load(weights)?));
+    }
+    let mut all = Vec::with_capacity(frames);
+    for tick in 0..frames {
+        let loaded = scenario.load_tick(tick, 0..vehicles, &LoadOptions::default());
+        let mut sent = Vec::with_capacity(vehicles);
+        for (agent, frame) in &loaded.frames {
+            sent.push(message(&mut agents[*agent], frame, method, *agent == 0, &mut random)?);
+        }
+        all.push(sent);
+    }
+    Ok(all)
+}
+
+fn message(
+    agent: &mut Agent,
+    frame: &Frame,
+    method: Method,
+    is_ego: bool,
+    random: &mut ChaCha8Rng,
+) -> Result<Sent, Failure> {
+    let input = AgentInput {
+        capture_nanos: frame.capture_nanos,
+        cloud: &frame.points,
+        measured_pose: frame.world_from_lidar.as_ref(),
+        motion: frame.motion(),
+    };
+    let mut pose = agent.estimate_pose(&input);
+    if let PoseEstimate::Pose { world_from_cav, confidence, .. } = &mut pose {
+        let [x, y, z] = world_from_cav.translation_m;
+        let mut error = |most: f64| random.random_range(-most..most);
+        let place = [x + error(POSE_ERROR_M), y + error(POSE_ERROR_M), z];
+        *world_from_cav = Pose::from_xyz_yaw(place, world_from_cav.yaw_rad() + error(HEADING_ERROR_RAD));
+        *confidence = CONFIDENCE;
+    }
+    let (content, features) = match method.own_content() {
+        Exchange::Points => (Content::Points(agent.share_points(&frame.points)), None),
+        Exchange::Boxes => (Content::Boxes(agent.perceive(&frame.points)?.detections), None),
+        Exchange::Features | Exchange::Nothing => {
+            let perception = agent.perceive(&frame.points)?;
+            let gate = method.gate().filter(|_| !is_ego);
+            let codec = CodecConfig { gate, ..CodecConfig::default() };
+            let features = agent.write_map(perception.features, &perception.confidence, &codec, frame.capture_nanos)?;
+            (Content::Boxes(Vec::new()), Some(features))
+        }
+    };
+    let view = View { cav: frame.cav.clone(), pose, capture_nanos: frame.capture_nanos, content };
+    Ok(Sent { view, features })
+}
+
+/// One line: the mean over the frames from the third on, where the history is full.
+fn print(method: Method, vehicles: usize, best: &[BTreeMap<String, f64>]) {
+    let full = &best[best.len().min(3) - 1..];
+    let stages = full.last().into_iter().flat_map(BTreeMap::keys);
+    let mean = |stage: &String| full.iter().filter_map(|frame| frame.get(stage)).sum::<f64>() / full.len() as f64;
+    let texts: Vec<String> = stages.map(|stage| format!("{stage} {:.2}", mean(stage))).collect();
+    println!("{method}/{vehicles}: {} ms", texts.join(", "));
+}

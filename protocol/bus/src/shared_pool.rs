@@ -1,0 +1,111 @@
+//! Pool of shared memory for the large messages of a process.
+//!
+//! A message in shared memory crosses sockets as a descriptor of some hundred bytes, through the router and to every
+//! receiver that is attached to shared memory; zenoh copies it for all others. A message for which the pool has no
+//! room, or whose router is not attached, takes the socket; both are counted ([`SharedMemoryUse`]).
+
+use std::sync::Arc;
+
+use bytes::Bytes;
+use protocol::wire::Encoded;
+use zenoh::bytes::ZBytes;
+use zenoh::shm::{Defragment, GarbageCollect, PosixShmProviderBackend, ShmProvider, ShmProviderBuilder, ZShmMut};
+use zenoh::{Session, Wait};
+
+use super::message_stats::SharedMemoryUse;
+use super::{BusError, MessageStats};
+
+/// Bodies of fewer bytes take the socket.
+const SMALL_BYTES: usize = 16 << 10;
+/// Folder in which the system keeps shared memory.
+const FOLDER: &str = "/dev/shm";
+
+/// The pool of a process, or none. Clones share it.
+#[derive(Clone)]
+pub(super) struct SharedPool(Option<Arc<Pool>>);
+
+struct Pool {
+    provider: ShmProvider<PosixShmProviderBackend>,
+    session: Session,
+    stats: MessageStats,
+}
+
+impl SharedPool {
+    /// No pool: all messages take the socket.
+    pub(super) fn none() -> Self {
+        Self(None)
+    }
+
+    /// A pool of `bytes` for the messages of `session`; 0: none.
+    ///
+    /// # Errors
+    /// [`BusError::SharedMemory`] when the system has too little; [`BusError::Zenoh`] when it gives none.
+    pub(super) fn open(session: &Session, bytes: usize, stats: &MessageStats) -> Result<Self, BusError> {
+        if bytes == 0 {
+            return Ok(Self::none());
+        }
+        check_room(bytes)?;
+        let provider = ShmProviderBuilder::default_backend(bytes).wait();
+        let provider = provider.map_err(|cause| BusError::zenoh("making a pool of shared memory", &cause))?;
+        Ok(Self(Some(Arc::new(Pool { provider, session: session.clone(), stats: stats.clone() }))))
+    }
+
+    /// Head and body concatenated; a large body is copied into the pool, others are not copied.
+    pub(super) fn payload(&self, encoded: Encoded) -> ZBytes {
+        let Encoded { head, body } = encoded;
+        let mut writer = ZBytes::writer();
+        writer.append(head.into());
+        if !body.is_empty() {
+            match self.shared(body.as_ref()) {
+                Some(shared) => writer.append(shared.into()),
+                None => writer.append(Bytes::from_owner(body).into()),
+            }
+        }
+        writer.finish()
+    }
+
+    /// A copy of a large body in the pool.
+    fn shared(&self, body: &[u8]) -> Option<ZShmMut> {
+        let Pool { provider, session, stats } = self.0.as_deref().filter(|_| body.len() >= SMALL_BYTES)?;
+        if !is_router_attached(session) {
+            stats.shared(SharedMemoryUse::RouterNotAttached);
+            return None;
+        }
+        // Without waiting: a receiver that holds many messages must not delay the others.
+        let place = provider.alloc(body.len()).with_policy::<Defragment<GarbageCollect>>().wait();
+        let Ok(mut place) = place else {
+            stats.shared(SharedMemoryUse::PoolFull);
+            return None;
+        };
+        place.as_mut().copy_from_slice(body);
+        stats.shared(SharedMemoryUse::Carried);
+        Some(place)
+    }
+}
+
+fn is_router_attached(session: &Session) -> bool {
+    session.info().transports().wait().any(|transport| transport.is_shm())
+}
+
+/// A segment is made without its memory, and a process is killed when it writes where there is none.
+fn check_room(bytes: usize) -> Result<(), BusError> {
+    // Elsewhere shared memory is not in a folder.
+    let Ok(room) = rustix::fs::statvfs(FOLDER) else { return Ok(()) };
+    let free = room.f_bavail.saturating_mul(room.f_frsize);
+    if u64::try_from(bytes).is_ok_and(|bytes| bytes <= free) {
+        return Ok(());
+    }
+    Err(BusError::SharedMemory { wanted_mib: bytes >> 20, free_mib: free >> 20 })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_pool_larger_than_the_memory_is_refused() {
+        let error = check_room(usize::MAX).unwrap_err().to_string();
+        assert!(error.contains("shared memory") && error.contains("MiB"), "{error}");
+        check_room(1 << 20).unwrap();
+    }
+}
