@@ -21,7 +21,7 @@ const PINNED: [(&str, usize, u64); 32] = [
     ("descriptor", 204, 0x74a3_26fe_b862_302b),
     ("detections", 379, 0x3285_e95c_a74d_987f),
     ("truth", 576, 0xffd6_d436_540c_1d3c),
-    ("stats", 188, 0x7448_fef7_b0ee_2140),
+    ("stats", 222, 0x1808_33f0_af29_3e8f),
     ("bev", 2490, 0x8b41_c845_b8e4_c030),
     ("bev", 583, 0x1bbc_1d96_9890_ca1c),
     ("bev", 1338, 0x37e0_f886_dc11_f023),
