@@ -10,8 +10,7 @@ use protocol::Pose;
 use tch::nn::{self, Init};
 use tch::{Kind, TchError, Tensor};
 
-use crate::f64_tensor::{are_numbers, flat, with_order};
-use crate::warp::Order;
+use crate::f64_tensor::{Order, are_numbers, flat, with_order};
 
 /// Name of the parameter in weights files; absent in weights that were trained without it.
 pub(crate) const WEIGHT: &str = "steering.weight";

@@ -2,7 +2,14 @@
 
 use tch::{Device, Kind, TchError, Tensor, nn};
 
-use crate::warp::Order;
+/// Memory order of feature maps `[N, C, H, W]`; the values are the same.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Order {
+    /// A channel after another.
+    Planes,
+    /// A cell after another.
+    Cells,
+}
 
 /// Cells that are transposed together; their data fit into a core's L1 cache.
 pub(crate) const BLOCK: usize = 16;

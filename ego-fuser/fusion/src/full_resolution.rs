@@ -51,6 +51,14 @@ impl FullResolutionMap {
         })
     }
 
+    /// Features and sent cells in plain floats, where no gradient flows.
+    pub(crate) fn numbers(&self) -> Option<(&Cells, &[f32])> {
+        match self {
+            Self::Numbers { cells, sent } => Some((cells, sent)),
+            Self::Tensors { .. } => None,
+        }
+    }
+
     /// The same map; nothing is copied.
     pub(crate) fn shallow_clone(&self) -> Self {
         match self {

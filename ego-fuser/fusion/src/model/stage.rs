@@ -11,12 +11,12 @@ use tch::{Device, TchError, Tensor};
 
 use crate::channel_mixing::{self, ChannelMixing};
 use crate::classes::Classes;
-use crate::f64_tensor::are_numbers;
+use crate::f64_tensor::{Order, are_numbers};
 use crate::full_resolution::FullResolutionMap;
 use crate::maps::{AlignedMaps, EarlierMaps, MapMetadata, ReceivedMaps, larger_cells, with_cells_of};
 use crate::method::{Exchange, Method};
 use crate::settings::{FUSION_KEY, FusionConfig, Requirements};
-use crate::warp::{Order, WarpError, WarpedMaps, check, warp_cells, warp_to_ego};
+use crate::warp::{WarpError, WarpedMaps, check, warp_cells, warp_to_ego};
 use crate::{Fusion, FusionOutput};
 
 /// Prefix of the fusion's variables in a weights file.
@@ -223,7 +223,8 @@ impl FusionStage {
             return Ok((turned, warped));
         }
         turned.full_resolution = full_resolution(&turned)?;
-        let warped = warp_cells(&turned.full_resolution, &poses, grid)?;
+        let cells: Vec<_> = turned.full_resolution.iter().filter_map(FullResolutionMap::numbers).collect();
+        let warped = warp_cells(&cells, &poses, grid)?;
         Ok((turned, warped))
     }
 

@@ -12,9 +12,8 @@ mod sampling;
 use protocol::{BevGrid, Pose};
 use tch::{Kind, TchError, Tensor};
 
-pub(crate) use self::sampling::{Cells, Order};
+pub(crate) use self::sampling::Cells;
 use crate::f64_tensor::{are_numbers, as_batch};
-use crate::full_resolution::FullResolutionMap;
 
 /// `grid_sampler` reads zeros outside of the map.
 pub(crate) const PADDING_ZEROS: i64 = 0;
@@ -123,17 +122,17 @@ pub fn warp_to_ego(
     Ok(WarpedMaps { features: Tensor::f_cat(&moved, 0)?, mask: Tensor::f_cat(&masks, 0)? })
 }
 
-/// [`warp_to_ego`] of maps in plain floats: the channels of each cell are contiguous in the result too.
+/// [`warp_to_ego`] of maps in plain floats, each with its sent cells `[H * W]`: the channels of each cell are contiguous
+/// in the result too.
 pub(crate) fn warp_cells(
-    maps: &[FullResolutionMap],
+    maps: &[(&Cells, &[f32])],
     ego_from_cav: &[Pose],
     grid: &BevGrid,
 ) -> Result<WarpedMaps, WarpError> {
     let count = maps.len() as i64;
     let cells = (grid.height * grid.width) as usize;
     let (mut features, mut mask) = (Vec::new(), Vec::with_capacity(maps.len() * cells));
-    for (map, pose) in maps.iter().zip(ego_from_cav) {
-        let FullResolutionMap::Numbers { cells: map, sent } = map else { continue };
+    for ((map, sent), pose) in maps.iter().zip(ego_from_cav) {
         features.reserve(maps.len() * map.values().len() - features.len());
         let affine = cav_from_ego_normalized(pose, grid);
         if affine == UNMOVED {
@@ -292,8 +291,9 @@ mod tests {
         let maps = uniform(5, &[2, 3, 16, 32]);
         let poses = [Pose::IDENTITY, Pose::from_xyz_yaw([1.3, -0.4, 0.0], 0.2)];
         let planes = warp_to_ego(&maps, None, &poses, &GRID).unwrap();
-        let cells: Vec<_> = (0..2).map(|map| FullResolutionMap::of(&maps.narrow(0, map, 1), None).unwrap()).collect();
-        let cells = warp_cells(&cells, &poses, &GRID).unwrap();
+        let cells = [0, 1].map(|map| Cells::of(&maps.get(map)).unwrap());
+        let sent = [1.0; 16 * 32];
+        let cells = warp_cells(&cells.each_ref().map(|map| (map, &sent[..])), &poses, &GRID).unwrap();
         assert_eq!(planes.features, cells.features);
         assert_eq!(planes.mask, cells.mask);
     }

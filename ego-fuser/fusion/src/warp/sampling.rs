@@ -17,15 +17,6 @@ pub(crate) struct Cells {
     width: usize,
 }
 
-/// Memory order of the result; the values are the same.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Order {
-    /// A channel after another.
-    Planes,
-    /// A cell after another.
-    Cells,
-}
-
 /// A position on a map: the four cells around it with their weights, which are zero beyond the edges.
 #[derive(Clone, Copy)]
 struct Place {
