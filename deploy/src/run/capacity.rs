@@ -2,8 +2,9 @@
 //! where it does not keep up.
 
 use std::fmt;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
+use bus::process_cpu_s;
 use ego_fuser_offline::evaluation::Evaluator;
 use ego_fuser_offline::evaluation::stepped::ComputeTimes;
 use fusion::{Exchange, Method};
@@ -17,8 +18,8 @@ use crate::run::stepped::{evaluate_config, recorded};
 
 /// Time for computing frames; loading the models comes on top.
 const BUDGET: Duration = Duration::from_millis(600);
-/// CPU time of replay, transport, encoding, router and scorer, as a share of that of the networks: measured over the
-/// methods of the demo.
+/// CPU time of replay, transport, encoding, router and scorer, as a share of that of the networks: a round number, of
+/// which a run's report shows the parts.
 const OVERHEAD: f64 = 0.2;
 /// Share of the ticks from which a run counts as keeping up.
 const KEEPS_UP: f64 = 0.99;
@@ -40,7 +41,7 @@ pub struct Capacity {
     pub fuse_ms: f64,
     /// Time between two frames, milliseconds.
     pub period_ms: f64,
-    /// Speed of a core while others compute too, relative to one alone, 0..=1.
+    /// Speed of a core while the others compute too and other programs run, relative to one of an idle machine, 0..=1.
     pub shared_speed: f64,
     /// CPU time per frame of all processes on this machine, milliseconds.
     pub needed_ms: f64,
@@ -64,10 +65,16 @@ impl Capacity {
         let period_ms = period_nanos as f64 * 1e-6 / scene.rate;
         fleet.scenario.models.threads.apply();
         let vehicles = fleet.agents.len();
-        let times = Evaluator::new(evaluate_config(fleet))?.estimate(&recorded, vehicles, BUDGET)?;
+        let mut evaluator = Evaluator::new(evaluate_config(fleet))?;
+        let (began, before_s) = (Instant::now(), process_cpu_s());
+        let elapsed = evaluator.estimate(&recorded, vehicles, BUDGET)?;
+        // Share of a core that other programs leave.
+        let left = ((process_cpu_s() - before_s) / began.elapsed().as_secs_f64()).clamp(0.01, 1.0);
+        let [pose_ms, map_ms, fuse_ms] = [elapsed.pose_ms, elapsed.map_ms, elapsed.fuse_ms].map(|ms| ms * left);
+        let times = ComputeTimes { pose_ms, map_ms, fuse_ms };
         let machine = Machine::here();
         let threads = machine.cores.min(vehicles + 1);
-        let shared_speed = if threads > 1 { speed_of_many(threads) } else { 1.0 };
+        let shared_speed = left * if threads > 1 { speed_of_many(threads) } else { 1.0 };
         let remote = fleet.scenario.remote_agents.len();
         let method = fleet.scenario.method.name();
         Ok(Some(Self::of(
