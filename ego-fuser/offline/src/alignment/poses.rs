@@ -59,13 +59,16 @@ impl AlignmentMethod for Poses {
             std::collections::btree_map::Entry::Occupied(known) => known.into_mut(),
             std::collections::btree_map::Entry::Vacant(place) => place.insert((self.build)()?),
         };
-        Ok(Message::Pose(source.estimate(&PoseInput {
+        let input = PoseInput {
             cav: &frame.cav,
             capture_nanos: frame.capture_nanos,
             cloud: &frame.points,
             measured: measured.as_ref(),
             motion: frame.motion(),
-        })))
+        };
+        let estimate = source.estimate(&input);
+        source.observe(&input);
+        Ok(Message::Pose(estimate))
     }
 
     fn align(&self, _: &Vehicle<'_>, own: &Message, received: &Message) -> Result<Isometry3<f64>, NotAligned> {

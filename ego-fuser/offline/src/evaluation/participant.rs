@@ -1,5 +1,7 @@
 //! Participant of an evaluation: an agent, and for an adversary the attack on what it publishes.
 
+use std::time::{Duration, Instant};
+
 use agent::agent::{Agent, AgentInput, Perception};
 use agent::attack::Attack;
 use agent::output_filter::OutputFilter;
@@ -14,11 +16,21 @@ use super::sent::Sent;
 pub(super) struct Participant {
     agent: Agent,
     attack: Option<Attack>,
+    times: PoseTimes,
+}
+
+/// Durations of the last sweep's pose.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct PoseTimes {
+    /// Until the pose is published.
+    pub(super) estimate: Duration,
+    /// For the poses of later sweeps, after everything is published.
+    pub(super) observe: Duration,
 }
 
 impl Participant {
     pub(super) fn new(agent: Agent, attack: Option<Attack>) -> Self {
-        Self { agent, attack }
+        Self { agent, attack, times: PoseTimes::default() }
     }
 
     pub(super) fn cav(&self) -> &CavId {
@@ -34,8 +46,22 @@ impl Participant {
 
     /// The published pose.
     pub(super) fn pose(&mut self, input: &AgentInput<'_>) -> PoseEstimate {
+        let began = Instant::now();
         let pose = self.agent.estimate_pose(input);
+        self.times.estimate = began.elapsed();
         self.attack.as_ref().map_or(pose, |attack| attack.pose(pose))
+    }
+
+    /// Last step of a sweep.
+    pub(super) fn observe(&mut self, input: &AgentInput<'_>) {
+        let began = Instant::now();
+        self.agent.observe(input);
+        self.times.observe = began.elapsed();
+    }
+
+    /// Durations of the last sweep's pose.
+    pub(super) fn pose_times(&self) -> PoseTimes {
+        self.times
     }
 
     /// The published map, confidence and detections, from a map `[1, C, H, W]` of the encoder where there is one.

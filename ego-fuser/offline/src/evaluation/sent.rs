@@ -76,6 +76,8 @@ pub(super) fn view(
         motion: frame.motion(),
     };
     let pose = participant.pose(&input);
+    // Nothing of this sweep depends on it.
+    participant.observe(&input);
     let stamp = stamp(participant.cav(), frame.capture_nanos);
     let (_, pose_bytes) = through_the_wire(&stamp, pose)?;
     let sent = |content, payload_bytes, wire_bytes| Sent {

@@ -2,13 +2,12 @@
 
 use std::time::{Duration, Instant};
 
-use agent::agent::AgentInput;
 use dataset::{LoadOptions, Scenario};
 use ego_fuser::ego::View;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use support::nanos;
-use support::statistics::median;
+use support::statistics::{mean, median};
 
 use super::super::{EvaluateError, Evaluator, view};
 
@@ -67,6 +66,15 @@ impl ComputeTimes {
     }
 }
 
+/// Durations of stages, milliseconds.
+#[derive(Debug, Default)]
+struct Samples {
+    pose: Vec<f64>,
+    observe: Vec<f64>,
+    map: Vec<f64>,
+    fuse: Vec<f64>,
+}
+
 impl Evaluator {
     /// Measures the first ticks of a scenario on this machine: medians, rounded up to whole milliseconds. In a scenario
     /// file they make its run repeatable.
@@ -76,7 +84,8 @@ impl Evaluator {
     pub fn measure(&mut self, scenario: &Scenario) -> Result<ComputeTimes, EvaluateError> {
         let samples = self.samples(scenario, MEASURED_VEHICLES, &|ticks| ticks < MEASURED_TICKS)?;
         let median = |sample: &[f64]| median(sample).unwrap_or(0.0).ceil();
-        let [pose_ms, map_ms, fuse_ms] = samples.each_ref().map(|sample| median(sample));
+        let Samples { pose, map, fuse, .. } = &samples;
+        let [pose_ms, map_ms, fuse_ms] = [pose, map, fuse].map(|sample| median(sample));
         Ok(ComputeTimes { pose_ms, map_ms, fuse_ms })
     }
 
@@ -100,17 +109,19 @@ impl Evaluator {
             median(warm).unwrap_or(0.0)
         };
         let agents = vehicles.min(MEASURED_VEHICLES);
-        let [pose, map, fuse] = samples;
-        Ok(ComputeTimes { pose_ms: warm(agents, &pose), map_ms: warm(agents, &map), fuse_ms: warm(1, &fuse) })
+        let Samples { pose, observe, map, fuse } = &samples;
+        // Not every sweep is measured after its pose was published.
+        let pose_ms = warm(agents, pose) + mean(observe).unwrap_or(0.0);
+        Ok(ComputeTimes { pose_ms, map_ms: warm(agents, map), fuse_ms: warm(1, fuse) })
     }
 
-    /// Durations of pose, map and fusion while `goes_on` with the number of ticks so far, milliseconds.
+    /// Durations while `goes_on` with the number of ticks so far.
     fn samples(
         &mut self,
         scenario: &Scenario,
         vehicles: usize,
         goes_on: &dyn Fn(usize) -> bool,
-    ) -> Result<[Vec<f64>; 3], EvaluateError> {
+    ) -> Result<Samples, EvaluateError> {
         let exchange = self.ego.method().own_content();
         let mut participants = scenario
             .agents
@@ -118,7 +129,7 @@ impl Evaluator {
             .take(MEASURED_VEHICLES)
             .map(|cav| self.participant(scenario, cav, true, None))
             .collect::<Result<Vec<_>, EvaluateError>>()?;
-        let [mut pose, mut map, mut fuse] = [const { Vec::<f64>::new() }; 3];
+        let Samples { mut pose, mut observe, mut map, mut fuse } = Samples::default();
         self.ego.forget();
         for tick in (0..scenario.ticks.len()).take_while(|tick| goes_on(*tick)) {
             let mut sent = Vec::with_capacity(participants.len());
@@ -127,18 +138,13 @@ impl Evaluator {
                     continue;
                 }
                 let frame = scenario.load(place, tick, &LoadOptions::default())?;
-                let input = AgentInput {
-                    capture_nanos: frame.capture_nanos,
-                    cloud: &frame.points,
-                    measured_pose: frame.world_from_lidar.as_ref(),
-                    motion: frame.motion(),
-                };
                 let began = Instant::now();
-                participant.pose(&input);
-                let pose_time = began.elapsed();
                 sent.extend(view(participant, &frame, None, Some(exchange), &self.config.codec)?.into_view());
-                pose.push(ms(pose_time));
-                map.push(ms(began.elapsed().saturating_sub(2 * pose_time)));
+                let all = began.elapsed();
+                let times = participant.pose_times();
+                pose.push(ms(times.estimate));
+                observe.push(ms(times.observe));
+                map.push(ms(all.saturating_sub(times.estimate + times.observe)));
             }
             let others = scenario.agents.iter().take(vehicles).skip(sent.len());
             let copies =
@@ -152,7 +158,7 @@ impl Evaluator {
             fuse.push(ms(began.elapsed()));
         }
         self.ego.forget();
-        Ok([pose, map, fuse])
+        Ok(Samples { pose, observe, map, fuse })
     }
 }
 
