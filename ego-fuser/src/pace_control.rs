@@ -1,6 +1,6 @@
 //! Pace control: where a machine cannot keep up, answers come less often instead of later.
 //!
-//! The controller counts overloaded frames: the own agent left a sweep out, or a frame waited behind another. Too many
+//! The controller counts overloaded frames: the own agent left a sweep out, or a frame waited for another one. Too many
 //! of them lengthen the interval by one sweep; a while without any shortens it again. Failed attempts double that while.
 
 use std::collections::VecDeque;
@@ -47,14 +47,15 @@ impl PaceControl {
         }
     }
 
-    /// Judges a frame of the own agent; `has_waited`: it waited behind another. Returns the pace if that changes.
-    pub(crate) fn judge(&mut self, capture_nanos: u64, has_waited: bool, now: Instant) -> Option<Pace> {
+    /// Judges a frame of the own agent that waited for another one. Returns the pace if that changes.
+    pub(crate) fn judge(&mut self, capture_nanos: u64, waited: Duration, now: Instant) -> Option<Pace> {
         let gap_nanos = self.last_nanos.replace(capture_nanos).and_then(|last| capture_nanos.checked_sub(last));
         // The first frame, or one of a scene that has restarted.
         let gap_nanos = gap_nanos.filter(|gap| *gap > 0)?;
         let period_nanos = self.period_nanos.map_or(gap_nanos, |period| period.min(gap_nanos));
         self.period_nanos = Some(period_nanos);
         let interval_nanos = period_nanos.saturating_mul(self.step);
+        let has_waited = waited > Duration::from_nanos(period_nanos / 2);
         let is_overloaded = has_waited || gap_nanos > interval_nanos.saturating_add(period_nanos / 2);
         if is_overloaded {
             self.quiet_since = now;
@@ -94,6 +95,10 @@ mod tests {
 
     const SWEEP_NANOS: u64 = 100_000_000;
 
+    fn waited(is_long: bool) -> Duration {
+        Duration::from_millis(if is_long { 60 } else { 40 })
+    }
+
     /// A machine that needs `needed` sweep periods for a frame; the intervals of the paces that its ego publishes.
     fn intervals(needed: u64, seconds: u64) -> Vec<u64> {
         let start = Instant::now();
@@ -109,7 +114,7 @@ mod tests {
             last = interval;
             free_at = sweep + needed;
             let now = start + Duration::from_nanos(capture_nanos);
-            if let Some(next) = control.judge(capture_nanos, false, now) {
+            if let Some(next) = control.judge(capture_nanos, Duration::ZERO, now) {
                 pace = next;
                 last = next.interval_of(capture_nanos);
                 changes.push(next.interval_nanos / SWEEP_NANOS);
@@ -129,7 +134,7 @@ mod tests {
         let mut control = PaceControl::new(start);
         for sweep in 0..100u64 {
             let now = start + Duration::from_millis(100 * sweep);
-            assert_eq!(control.judge(sweep * SWEEP_NANOS, sweep % 6 == 0, now), None);
+            assert_eq!(control.judge(sweep * SWEEP_NANOS, waited(sweep % 6 == 0), now), None);
         }
     }
 
@@ -141,7 +146,7 @@ mod tests {
         while sweep < 3000 {
             let now = start + Duration::from_millis(100 * sweep);
             // Every sweep is too much, every second one is not.
-            if let Some(pace) = control.judge(sweep * SWEEP_NANOS, step == 1 && sweep > 0, now) {
+            if let Some(pace) = control.judge(sweep * SWEEP_NANOS, waited(step == 1 && sweep > 0), now) {
                 step = (pace.interval_nanos / SWEEP_NANOS).max(1);
                 if step == 1 {
                     tries.push(sweep);
@@ -160,8 +165,8 @@ mod tests {
         let start = Instant::now();
         let mut control = PaceControl::new(start);
         for _ in 0..50 {
-            assert_eq!(control.judge(5 * SWEEP_NANOS, true, start), None);
-            assert_eq!(control.judge(4 * SWEEP_NANOS, true, start), None);
+            assert_eq!(control.judge(5 * SWEEP_NANOS, waited(true), start), None);
+            assert_eq!(control.judge(4 * SWEEP_NANOS, waited(true), start), None);
         }
     }
 }

@@ -105,7 +105,7 @@ impl Topic {
     pub fn is_booked(&self) -> bool {
         match self {
             Self::Stream { stream, .. } | Self::Received { stream, .. } => {
-                !matches!(stream, Stream::Descriptor | Stream::Preview)
+                !matches!(stream, Stream::Descriptor | Stream::Pace | Stream::Preview)
             }
             Self::Truth => true,
             Self::Control(_) | Self::Ready(_) | Self::Stats(_) | Self::Alive { .. } => false,

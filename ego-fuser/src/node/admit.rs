@@ -38,8 +38,9 @@ impl Node<'_> {
         if *cav == self.cav {
             self.keep_time(capture_nanos);
             let agent_frame = arrival.header.stamp.sequence;
-            let has_waited = !self.frames.is_empty();
-            self.pace.iter_mut().for_each(|pace| pace.judge(capture_nanos, has_waited));
+            // In the inbox, while another frame was fused, or behind one that waits for its neighbours.
+            let waited = if self.frames.is_empty() { arrival.at.elapsed() } else { Duration::MAX };
+            self.pace.iter_mut().for_each(|pace| pace.judge(capture_nanos, waited));
             self.frames.push_back(OwnFrame { agent_frame, capture_nanos, transport, begun: arrival.at, view });
             return;
         }

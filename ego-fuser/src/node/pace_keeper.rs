@@ -30,9 +30,9 @@ impl PaceKeeper {
         })
     }
 
-    /// Judges a frame of the own agent; `has_waited`: it waits behind another.
-    pub(super) fn judge(&mut self, capture_nanos: u64, has_waited: bool) {
-        let Some(pace) = self.control.judge(capture_nanos, has_waited, Instant::now()) else { return };
+    /// Judges a frame of the own agent that has waited for another one.
+    pub(super) fn judge(&mut self, capture_nanos: u64, waited: Duration) {
+        let Some(pace) = self.control.judge(capture_nanos, waited, Instant::now()) else { return };
         let interval = Duration::from_nanos(pace.interval_nanos);
         tracing::info!(capture_nanos, ?interval, "the pace of the fleet changes; interval 0: every sweep");
         self.publish(pace);
