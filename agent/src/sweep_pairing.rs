@@ -33,8 +33,8 @@ pub(crate) struct Unused {
     pub(crate) motions: usize,
 }
 
-/// Holds the newest sweep until its pose arrives, or is known to be lost; likewise its motion, if the one of the sweep
-/// before had arrived.
+/// Holds the newest sweep until its pose arrives, or is known to be lost; likewise its motion, but for vehicles without a
+/// motion sensor: after one sweep without a motion none is awaited until one arrives.
 #[derive(Debug)]
 pub(crate) struct SweepPairing<S> {
     timeout: Duration,
@@ -53,7 +53,7 @@ impl<S> SweepPairing<S> {
             waiting: None,
             poses: CaptureBuffer::default(),
             motions: CaptureBuffer::default(),
-            expects_motion: false,
+            expects_motion: true,
         }
     }
 
@@ -149,6 +149,10 @@ mod tests {
 
     const TIMEOUT: Duration = Duration::from_millis(200);
 
+    fn without_motion() -> SweepPairing<char> {
+        SweepPairing { expects_motion: false, ..SweepPairing::new(TIMEOUT) }
+    }
+
     fn at(x_m: f64) -> Pose {
         Pose::from_xyz_yaw([x_m, 0.0, 0.0], 0.0)
     }
@@ -160,7 +164,7 @@ mod tests {
 
     #[test]
     fn a_sweep_is_paired_with_its_pose_in_either_order() {
-        let (mut pairing, now) = (SweepPairing::new(TIMEOUT), Instant::now());
+        let (mut pairing, now) = (without_motion(), Instant::now());
         assert_eq!(pairing.add_pose(10, at(1.0)), 0);
         assert_eq!(pairing.add_sweep(10, 'a', now), None);
         assert_eq!(paired(&mut pairing, now), Some((10, 'a', Some(1.0), 0)));
@@ -172,7 +176,7 @@ mod tests {
 
     #[test]
     fn a_lost_pose_is_noticed_by_the_next_or_by_the_time() {
-        let (mut pairing, now) = (SweepPairing::new(TIMEOUT), Instant::now());
+        let (mut pairing, now) = (without_motion(), Instant::now());
         assert_eq!(pairing.add_sweep(10, 'a', now), None);
         assert_eq!(pairing.add_pose(20, at(2.0)), 0);
         assert_eq!(paired(&mut pairing, now), Some((10, 'a', None, 0)));
@@ -184,7 +188,7 @@ mod tests {
 
     #[test]
     fn a_restarted_scene_is_not_mistaken_for_one_with_lost_poses() {
-        let (mut pairing, now) = (SweepPairing::new(TIMEOUT), Instant::now());
+        let (mut pairing, now) = (without_motion(), Instant::now());
         assert_eq!(pairing.add_pose(90, at(9.0)) + pairing.add_pose(100, at(10.0)), 0);
         assert_eq!(pairing.add_pose(10, at(1.0)), 2, "those of the old scene are dropped and counted");
         assert_eq!(pairing.add_sweep(20, 'b', now), None);
@@ -197,7 +201,7 @@ mod tests {
 
     #[test]
     fn the_largest_capture_time_has_no_later_poses() {
-        let (mut pairing, now) = (SweepPairing::new(TIMEOUT), Instant::now());
+        let (mut pairing, now) = (without_motion(), Instant::now());
         assert_eq!(pairing.add_pose(10, at(1.0)) + pairing.add_pose(u64::MAX, at(2.0)), 0);
         assert_eq!(pairing.add_sweep(u64::MAX, 'z', now), None);
         assert_eq!(paired(&mut pairing, now), Some((u64::MAX, 'z', Some(2.0), 1)));
@@ -207,7 +211,7 @@ mod tests {
 
     #[test]
     fn replaced_sweeps_are_returned() {
-        let (mut pairing, now) = (SweepPairing::new(TIMEOUT), Instant::now());
+        let (mut pairing, now) = (without_motion(), Instant::now());
         assert_eq!(pairing.add_sweep(10, 'a', now), None);
         assert_eq!(pairing.add_sweep(20, 'b', now), Some('a'));
         let gone: usize = (0..40).map(|k| pairing.add_pose(100 + k, at(0.0))).sum();
@@ -223,7 +227,10 @@ mod tests {
             assert_eq!(pairing.add_sweep(capture_nanos, 'a', now), None);
         };
         sweep(&mut pairing, 10);
-        assert_eq!(pairing.next(now).unwrap().motion, None, "there was never a motion");
+        assert_eq!(pairing.next(now), None, "there may be a sensor");
+        assert_eq!(pairing.next(now + TIMEOUT).unwrap().motion, None);
+        sweep(&mut pairing, 12);
+        assert_eq!(pairing.next(now).unwrap().motion, None, "there is none");
         assert_eq!(pairing.add_motion(15, speed(5.0)) + pairing.add_motion(20, speed(6.0)), 0);
         sweep(&mut pairing, 20);
         let paired = pairing.next(now).unwrap();

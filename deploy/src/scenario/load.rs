@@ -223,7 +223,7 @@ mod tests {
         let mut plain = parse(SMALL).unwrap();
         (plain.scene.dir, plain.models.weights) = (demo.scene.dir.clone(), demo.models.weights.clone());
         plain.agents.codec.dtype = Dtype::F16;
-        assert!(matches!(demo.agents.pose, PoseSourceConfig::Pgc(_)));
+        assert!(matches!(demo.agents.pose, PoseSourceConfig::Tracked(_)));
         plain.agents.pose = demo.agents.pose.clone();
         assert_eq!(demo, plain);
     }

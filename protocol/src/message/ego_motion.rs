@@ -21,12 +21,6 @@ const MAX_SPEED_MPS: f64 = 200.0;
 const MAX_YAW_RATE_RAD_S: f64 = 20.0;
 
 impl EgoMotion {
-    /// True if nothing is measured.
-    #[must_use]
-    pub fn is_empty(&self) -> bool {
-        self.speed_mps.is_none() && self.yaw_rate_rad_s.is_none()
-    }
-
     fn check_values(&self, _: &Limits) -> Result<(), WireError> {
         check_within("speed_mps", self.speed_mps.unwrap_or(0.0), -MAX_SPEED_MPS, MAX_SPEED_MPS)?;
         check_within("yaw_rate_rad_s", self.yaw_rate_rad_s.unwrap_or(0.0), -MAX_YAW_RATE_RAD_S, MAX_YAW_RATE_RAD_S)

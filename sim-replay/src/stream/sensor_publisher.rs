@@ -60,11 +60,9 @@ impl SensorPublisher {
             sensors.gnss.submit(capture_nanos, gnss);
             count(&mut self.sent, sensors.gnss.topic());
         }
-        let motion = frame.motion();
-        if !motion.is_empty() {
-            sensors.imu.submit(capture_nanos, motion);
-            count(&mut self.sent, sensors.imu.topic());
-        }
+        // Empty where nothing is recorded: the agent need not wait for it.
+        sensors.imu.submit(capture_nanos, frame.motion());
+        count(&mut self.sent, sensors.imu.topic());
         if sensors.preview.is_wanted() {
             sensors.preview.submit(capture_nanos, Lidar { points: frame.points.decimate(PREVIEW_POINTS) });
         }

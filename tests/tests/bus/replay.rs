@@ -81,7 +81,7 @@ fn every_tick_reaches_every_agent_in_order() {
     let report = play(&router, &scenario, StreamOptions { rate: 0.0, ..StreamOptions::default() });
     let recorded: Vec<u64> = scenario.ticks.iter().map(|tick| tick.capture_nanos).collect();
     let captures = listener.captures();
-    assert_eq!(captures.len(), 5);
+    assert_eq!(captures.len(), 7);
     for (topic, captures) in captures {
         assert_eq!(captures, recorded, "{topic}");
     }

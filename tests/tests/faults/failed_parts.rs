@@ -36,7 +36,11 @@ fn a_cut_recording_is_reported_by_report_status_and_exit_code() {
     let recording = run.join("recording.mcap");
     let advice = format!("messages missing; sim-replay recover {} --out ", recording.display());
     for text in ["recorder: recording cut at ", " s: ", &advice] {
-        assert_eq!(output.matches(text).count(), 2, "at once, and in the report: {output}");
+        assert_eq!(
+            output.matches(text).count(),
+            3,
+            "at once, in the report and as the reason of the exit code: {output}"
+        );
     }
     assert_eq!(results(&run).len(), 14, "the run goes on");
     let (code, status) = outcome(Command::new(programs().join("v2vloc")).arg("status").arg(&run));

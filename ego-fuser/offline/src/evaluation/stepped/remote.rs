@@ -140,9 +140,7 @@ impl RemotePool {
                 let measured = Gnss { world_from_lidar, position_std_m: 0.0, heading_std_rad: 0.0, source };
                 gnss.submit(frame.capture_nanos, measured);
             }
-            if !frame.motion().is_empty() {
-                imu.submit(frame.capture_nanos, frame.motion());
-            }
+            imu.submit(frame.capture_nanos, frame.motion());
             lidar.submit(frame.capture_nanos, Lidar { points: frame.points.clone() });
         }
         let deadline = Instant::now() + TIMEOUT;
