@@ -108,10 +108,10 @@ impl Agent {
     }
 
     /// Last step if there is no queue: the feature map as `codec` specifies, or smaller if a limit requires it. A live
-    /// agent does this on its sending thread, with a [`RateControl`] of its own that measures the queue.
+    /// agent does this on its sending thread, with a `RateControl` of its own that measures the queue.
     ///
     /// # Errors
-    /// As [`RateControl::encode`].
+    /// As `RateControl::encode`.
     pub fn write_map(
         &mut self,
         features: BevFeatures,

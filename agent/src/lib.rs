@@ -1,7 +1,7 @@
 //! Agent of one connected vehicle: pose and BEV features of each of its sweeps, published on the bus.
 //!
 //! - [`agent`]: the pipeline, synchronous and without a network; [`node`]: the process around it.
-//! - [`rate`]: bytes per message under a byte budget; [`sweep_pairing`]: sweep and starting pose of one capture time.
+//! - [`rate`]: bytes per message under a byte budget; `sweep_pairing`: sweep and starting pose of one capture time.
 //! - [`attack`]: falsified messages, for experiments on misbehaviour detection.
 
 #![warn(clippy::print_stdout, clippy::print_stderr)]

@@ -6,7 +6,7 @@
 /// `max_metadata_bytes + 2 * max_body_bytes` and a few kilobytes.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Limits {
-    /// Metadata of one message, bytes; never more than [`Limits::HARD_METADATA_BYTES`].
+    /// Metadata of one message, bytes; never more than `Limits::HARD_METADATA_BYTES`.
     pub max_metadata_bytes: u32,
     /// Body of one message, on the wire and decoded, bytes.
     pub max_body_bytes: u64,

@@ -50,7 +50,7 @@ impl Encoded {
 ///
 /// # Errors
 /// [`WireError`] when the metadata exceed the limits of every receiver: a value out of bounds, an invalid pose, more
-/// than [`Limits::HARD_METADATA_BYTES`].
+/// than `Limits::HARD_METADATA_BYTES`.
 pub fn encode<M: Payload>(stamp: &Stamp, message: M) -> Result<Encoded, WireError> {
     let (metadata, body) = message.into_parts();
     let shape = M::check(&metadata, &Limits::SENDER)?;

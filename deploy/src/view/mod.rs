@@ -2,7 +2,7 @@
 //!
 //! The page is part of this program and loads nothing from anywhere else. Its data come from a live run ([`LiveRun`]),
 //! through a passive subscriber outside the message accounting, or from a recorded one ([`RecordedRun`]); both feed the
-//! same [`FrameAssembler`], which returns [`SceneFrame`]s.
+//! same `FrameAssembler`, which returns [`SceneFrame`]s.
 
 mod frame_assembler;
 mod live;

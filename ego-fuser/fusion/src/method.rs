@@ -27,7 +27,7 @@ pub struct Method(&'static MethodSpec);
 macro_rules! methods {
     ($($name:ident: $spec:path,)*) => {
         impl Method {
-            $(#[doc = concat!("See [`", stringify!($spec), "`].")]
+            $(#[doc = concat!("See `", stringify!($spec), "`.")]
             pub const $name: Self = Self(&$spec);)*
 
             /// Every method, in the order of tables.

@@ -20,7 +20,7 @@ pub(crate) const UNAUTHORISED: &str = "unauthorised";
 /// Rejection of a message or of a connection by a router.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Rejection {
-    /// Common name of the certificate, or the session's id without one; [`UNAUTHORISED`] for peers not admitted.
+    /// Common name of the certificate, or the session's id without one; `UNAUTHORISED` for peers not admitted.
     pub peer: String,
     /// `access-control`, `low-pass` or `handshake`.
     pub reason: String,

@@ -54,7 +54,7 @@ impl PillarGrid {
 /// Packed pillars of `B` sweeps: `P` points on `M` pillars.
 #[derive(Debug)]
 pub struct PillarBatch {
-    /// `[P, 10]` `f32`: see [`POINT_FEATURES`].
+    /// `[P, 10]` `f32`: see `POINT_FEATURES`.
     pub features: Tensor,
     /// `[M]` `i64`: number of points of each pillar.
     pub counts: Tensor,

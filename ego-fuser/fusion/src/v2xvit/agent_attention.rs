@@ -66,7 +66,7 @@ impl AgentAttention {
     /// # Shapes
     /// - `x`: `[N, T, C]`, `T` cells
     /// - `unseen`: `[N, T]`, 0 where a cell of an agent is valid and minus infinity where not; absent: all are valid
-    /// - `types`: `N` below [`AGENT_TYPES`]
+    /// - `types`: `N` below `AGENT_TYPES`
     /// - returns: `[queries, T, C]`
     ///
     /// # Errors

@@ -30,7 +30,7 @@ pub(super) struct Origin {
     pub(super) lane: i32,
 }
 
-/// Builds the driving lanes of `network` and their links. [`Road::leads_along`] gives the direction of each lane:
+/// Builds the driving lanes of `network` and their links. `Road::leads_along` gives the direction of each lane:
 /// traffic keeps right or left, road by road.
 #[must_use]
 pub fn lane_graph(network: &RoadNetwork) -> (LaneGraph, LinkCounts) {

@@ -61,7 +61,7 @@ pub struct Body<'a> {
 
 /// The ground surface.
 pub trait Surface {
-    /// Shortens `depth` to the ground where rays hit it, and writes [`GROUND`] into `hit` there.
+    /// Shortens `depth` to the ground where rays hit it, and writes `GROUND` into `hit` there.
     ///
     /// Ray `i` leaves `origin` (world, metres) along `forward * cos[i] + up * sin[i]`, a unit vector.
     fn cast(&self, rays: &SurfaceRays<'_>, depth: &mut [f32], hit: &mut [u32]);
