@@ -7,7 +7,8 @@ use protocol::{CavId, Pace, Stream, Topic};
 
 use crate::pace_control::PaceControl;
 
-/// Period at which a pace other than every sweep is repeated, for agents that join late.
+/// Period at which the pace is repeated: for agents that join late, and so that a slower ego of the fleet does not set
+/// the pace of one that keeps up.
 const REPEAT_PERIOD: Duration = Duration::from_secs(1);
 
 /// Controller of the pace, and its publisher.
@@ -40,7 +41,7 @@ impl PaceKeeper {
 
     /// Publishes the pace again, if it is time for that.
     pub(super) fn repeat(&mut self) {
-        if self.pace != Pace::EVERY_SWEEP && self.published.elapsed() >= REPEAT_PERIOD {
+        if self.published.elapsed() >= REPEAT_PERIOD {
             self.publish(self.pace);
         }
     }

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{check_nanos, metadata_only};
+use super::metadata_only;
 use crate::Limits;
 use crate::WireError;
 
@@ -18,6 +18,9 @@ pub struct Pace {
 /// Sweeps captured this long before an interval belong to it: sensors of different vehicles are not synchronised.
 const TOLERANCE_NANOS: u64 = 25_000_000;
 
+/// Longest interval of a message, nanoseconds: no ego may stop the agents of others.
+const MAX_INTERVAL_NANOS: u64 = 10_000_000_000;
+
 impl Pace {
     /// Every sweep.
     pub const EVERY_SWEEP: Self = Self { interval_nanos: 0, phase_nanos: 0 };
@@ -30,7 +33,8 @@ impl Pace {
     }
 
     fn check_values(&self, _: &Limits) -> Result<(), WireError> {
-        check_nanos("interval_nanos", self.interval_nanos)
+        let (max, found) = (MAX_INTERVAL_NANOS, self.interval_nanos);
+        if found <= max { Ok(()) } else { Err(WireError::Limit { what: "interval_nanos", max, found }) }
     }
 }
 
