@@ -14,6 +14,8 @@ use crate::attack::Falsification;
 use crate::node::NodeOptions;
 use crate::rate::RateConfig;
 use localization::pose_source::PoseSourceConfig;
+use perception::int8::InferencePrecision;
+use perception::weights::{Weights, WeightsError};
 
 /// Configuration of `agent run`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema, clap::Args)]
@@ -57,10 +59,24 @@ pub struct ModelConfig {
     /// Weights of the detector (safetensors; its configuration is inside).
     #[arg(long, value_name = "FILE", required_unless_present = "config")]
     pub weights: PathBuf,
+    /// Number format in which networks are computed.
+    #[arg(long, value_enum, default_value_t)]
+    #[serde(default)]
+    pub precision: InferencePrecision,
     /// Threads that libtorch computes with, 1 to 256; the same number gives the same bits.
     #[arg(long)]
     #[serde(default)]
     pub threads: Threads,
+}
+
+impl ModelConfig {
+    /// Reads the weights for the configured number format.
+    ///
+    /// # Errors
+    /// [`WeightsError`] names the file.
+    pub fn load(&self) -> Result<Weights, WeightsError> {
+        Ok(Weights::load(&self.weights)?.with_precision(self.precision))
+    }
 }
 
 /// Settings of a vehicle's agent: the same in a scenario, for all vehicles or for one.

@@ -73,14 +73,21 @@ impl Ego {
     /// # Errors
     /// [`EgoError`] names the file, the tensor and both shapes.
     pub fn load(path: &Path, method: Option<Method>) -> Result<Self, EgoError> {
-        let weights = Weights::load(path)?;
+        Self::from_weights(&Weights::load(path)?, method)
+    }
+
+    /// The same from a file already read.
+    ///
+    /// # Errors
+    /// As [`Self::load`].
+    pub fn from_weights(weights: &Weights, method: Option<Method>) -> Result<Self, EgoError> {
         let method = match (method, weights.metadata(METHOD_KEY)) {
             (Some(method), _) => method,
             (None, Some(name)) => name.parse()?,
             (None, None) => Method::NONE,
         };
-        let detector = Detector::from_weights(&weights, &weights.config()?)?;
-        let fusion = FusionStage::from_weights(&weights, method, detector.config())?;
+        let detector = Detector::from_weights(weights, &weights.config()?)?;
+        let fusion = FusionStage::from_weights(weights, method, detector.config())?;
         Ok(Self::assembled(detector, method, fusion))
     }
 
@@ -124,6 +131,11 @@ impl Ego {
     #[must_use]
     pub fn detector(&self) -> &Detector {
         &self.detector
+    }
+
+    /// Its fusion, to search the scales of activations.
+    pub fn fusion_mut(&mut self) -> &mut FusionStage {
+        &mut self.fusion
     }
 
     /// Removes the maps of earlier frames: another scene begins.

@@ -2,6 +2,7 @@
 //!
 //! - [`pillars`], [`layers`], [`detector`]: point cloud to BEV feature map to boxes.
 //! - [`boxes`]: anchors, decoding, non-maximum suppression and post-processing.
+//! - [`int8`]: the same layers in 8-bit integers, for inference.
 //! - [`sparse`]: sparse convolution, for the scene encoder of the localization.
 //! - [`weights`], [`model_config`]: checkpoints and the sizes of a model.
 //! - [`train`]: optimiser, schedule, checkpoints and progress of every training.
@@ -13,6 +14,7 @@
 pub mod boxes;
 pub mod crop;
 pub mod detector;
+pub mod int8;
 pub mod layers;
 pub mod model_config;
 pub mod pillars;

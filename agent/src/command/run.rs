@@ -50,7 +50,8 @@ pub(crate) fn run(args: Args) -> anyhow::Result<()> {
 }
 
 fn agent(config: &AgentConfig) -> anyhow::Result<Agent> {
-    let detector = Detector::load(&config.models.weights).context("weights")?;
+    let weights = config.models.load().context("weights")?;
+    let detector = Detector::from_weights(&weights, &weights.config()?).context("weights")?;
     Ok(Agent::new(config.cav.clone(), config.settings.pose.build()?, detector))
 }
 

@@ -18,6 +18,7 @@ use fusion::Method;
 use indicatif::ProgressBar;
 use link::LinkConfig;
 use localization::pose_source::PoseSourceConfig;
+use perception::int8::InferencePrecision;
 use protocol::CodecConfig;
 use protocol::config::{FieldError, Section};
 use support::output;
@@ -40,6 +41,9 @@ pub(crate) struct Arguments {
     /// the folder of a training.
     #[arg(long, value_name = "FILE", required_unless_present = "table")]
     weights: Option<PathBuf>,
+    /// Number format in which networks are computed.
+    #[arg(long, value_enum, default_value_t, conflicts_with = "table")]
+    precision: InferencePrecision,
     /// Instead: a file of tables, rows of methods and columns of conditions; cells that are done are kept in --out.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["dataset", "method", "weights"], requires = "out")]
     table: Option<PathBuf>,
@@ -150,6 +154,7 @@ impl Arguments {
             // Required without a table.
             dataset: self.dataset.clone().unwrap_or_default(),
             weights: self.weights.clone().unwrap_or_default(),
+            precision: self.precision,
             pose_source: self.pose.0.clone(),
             codec,
             rate: self.rate.0,

@@ -15,6 +15,7 @@ use ego_fuser_offline::evaluation::{EvaluateConfig, EvaluateError, Evaluator};
 use fusion::Exchange;
 use fusion::Method;
 use localization::pose_source::PoseSourceConfig;
+use perception::int8::InferencePrecision;
 use perception::weights::Weights;
 use protocol::{CavId, CodecConfig};
 use training::feature_store::{FeatureStore, KeptMaps, MapSource};
@@ -31,6 +32,8 @@ pub struct EvaluationOptions {
     pub dataset: PathBuf,
     /// Weights of the detector, or a folder that holds a file `<name>-<method>.safetensors` for each method.
     pub weights: PathBuf,
+    /// Number format in which networks are computed.
+    pub precision: InferencePrecision,
     /// Source of the vehicles' poses.
     pub pose_source: PoseSourceConfig,
     /// Encoding of feature maps.
@@ -166,6 +169,7 @@ pub(crate) fn judged(
     let weights = weights_of(&options.weights, method)?;
     let mut evaluator = Evaluator::new(EvaluateConfig {
         weights: weights.clone(),
+        precision: options.precision,
         method: Some(method),
         pose_source: options.pose_source.clone(),
         codec: options.codec,
@@ -176,7 +180,7 @@ pub(crate) fn judged(
         trust: options.trust,
     })?;
     if let Some(kept) = options.maps.as_ref().filter(|_| method.exchange() != Exchange::Points) {
-        evaluator = evaluator.with_maps(maps(kept, &weights, &scenarios)?);
+        evaluator = evaluator.with_maps(maps(kept, &weights, options.precision, &scenarios)?);
     }
     if let Some(stepped) = &options.stepped {
         evaluator = evaluator.with_link(stepped.clone());
@@ -211,8 +215,13 @@ pub(crate) fn judged(
 }
 
 /// Feature maps of all sweeps, from the cache or encoded now.
-fn maps(kept: &KeptMaps, weights: &Path, scenarios: &[Scenario]) -> Result<MapSource, EvaluationError> {
-    let weights = Arc::new(Weights::load(weights).map_err(EvaluateError::from)?);
+fn maps(
+    kept: &KeptMaps,
+    weights: &Path,
+    precision: InferencePrecision,
+    scenarios: &[Scenario],
+) -> Result<MapSource, EvaluationError> {
+    let weights = Arc::new(Weights::load(weights).map_err(EvaluateError::from)?.with_precision(precision));
     let store = FeatureStore::open(kept, &weights, scenarios, &mut |_, _| {});
     Ok(MapSource::new(Arc::new(store.map_err(|error| EvaluateError::from(Box::new(error)))?), weights))
 }

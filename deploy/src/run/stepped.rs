@@ -90,6 +90,7 @@ pub(super) fn evaluate_config(fleet: &Fleet) -> EvaluateConfig {
     let scenario = &fleet.scenario;
     EvaluateConfig {
         weights: scenario.models.weights.clone(),
+        precision: scenario.models.precision,
         method: Some(scenario.method),
         pose_source: for_scene(&scenario.agents.pose, scenario),
         codec: scenario.agents.codec,

@@ -2,6 +2,7 @@
 
 use std::fmt::Debug;
 
+use perception::int8::{ActivationScales, QuantiseError, ScaleSearch};
 use tch::{TchError, Tensor};
 
 use super::maps::AlignedMaps;
@@ -13,6 +14,22 @@ pub trait Fusion: Debug + Send {
     /// # Errors
     /// [`TchError`] when the shapes of features and mask do not fit.
     fn fuse(&self, maps: &AlignedMaps) -> Result<FusionOutput, TchError>;
+
+    /// Adds the activations of one sample that [`Self::quantise`] needs scales of.
+    ///
+    /// # Errors
+    /// As [`Self::fuse`].
+    fn observe(&self, _maps: &AlignedMaps, _search: &mut ScaleSearch) -> Result<(), TchError> {
+        Ok(())
+    }
+
+    /// Computes in 8-bit integers from here on, where it can.
+    ///
+    /// # Errors
+    /// [`QuantiseError`] names the activation whose scale is missing.
+    fn quantise(&mut self, _scales: &ActivationScales) -> Result<(), QuantiseError> {
+        Ok(())
+    }
 }
 
 /// Result of a fusion.

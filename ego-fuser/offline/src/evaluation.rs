@@ -25,6 +25,7 @@ use dataset::ground_truth::{self, GroundTruthRule};
 use dataset::{LeftOut, LoadOptions, Scenario};
 use localization::pose_source::{NoiseMode, PoseSourceConfig};
 use perception::detector::Detector;
+use perception::int8::InferencePrecision;
 use perception::model_config::DetectorConfig;
 use perception::weights::Weights;
 use protocol::message::{Detections, FusedNeighbour, SkippedNeighbour};
@@ -42,10 +43,12 @@ use stepped::{RemotePool, SteppedConfig, VehicleConfig};
 use sweeps::Sweep;
 
 /// Configuration of an evaluation.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub struct EvaluateConfig {
     /// Weights of encoder and head.
     pub weights: PathBuf,
+    /// Number format in which networks are computed.
+    pub precision: InferencePrecision,
     /// The method; absent: that of the weights.
     pub method: Option<Method>,
     /// Source of the vehicles' poses.
@@ -116,7 +119,8 @@ impl Evaluator {
     /// # Errors
     /// [`EvaluateError`] names the file and what is wrong with it.
     pub fn new(config: EvaluateConfig) -> Result<Self, EvaluateError> {
-        let ego = Ego::load(&config.weights, config.method)?.with_misbehaviour_detection(config.trust)?;
+        let weights = Weights::load(&config.weights)?.with_precision(config.precision);
+        let ego = Ego::from_weights(&weights, config.method)?.with_misbehaviour_detection(config.trust)?;
         let area = ego.detector().config();
         let rule = config
             .protocol
@@ -125,7 +129,6 @@ impl Evaluator {
         let ego = ego.with_comm_range(rule.comm_range_m);
         let codec = CodecConfig { gate: config.codec.gate.or(ego.method().gate()), ..config.codec };
         let config = EvaluateConfig { codec, ..config };
-        let weights = Weights::load(&config.weights)?;
         Ok(Self {
             weights,
             ego,
@@ -178,6 +181,11 @@ impl Evaluator {
     #[must_use]
     pub fn ego(&self) -> &Ego {
         &self.ego
+    }
+
+    /// The ego's pipeline, to change it.
+    pub fn ego_mut(&mut self) -> &mut Ego {
+        &mut self.ego
     }
 
     /// The protocol with the ground-truth rule that applies to this network; absent where none was configured.

@@ -24,6 +24,8 @@ pub(crate) enum Command {
     Eval(Forwarded),
     /// Measure the part of pose offsets that a method's own alignment leaves
     AlignmentError(Forwarded),
+    /// Prepare weights for 8-bit inference
+    Quantise(Forwarded),
     /// Run the fusing vehicle of a live fleet
     Run(Box<run::Arguments>),
     /// Train a method on scenes
@@ -43,6 +45,7 @@ impl Command {
             Self::Align(forwarded) => offline(forwarded, "align")?,
             Self::Eval(forwarded) => offline(forwarded, "eval")?,
             Self::AlignmentError(forwarded) => offline(forwarded, "alignment-error")?,
+            Self::Quantise(forwarded) => offline(forwarded, "quantise")?,
             Self::Train(forwarded) => offline(forwarded, "train")?,
         }
         Ok(Outcome::Done)

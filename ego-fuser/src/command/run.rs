@@ -3,7 +3,7 @@
 use anyhow::Context;
 use bus::{Configured, STOP_LIMIT, log_to_stderr};
 use ego_fuser::config::EgoConfig;
-use ego_fuser::ego::Ego;
+use ego_fuser::ego::{Ego, EgoError};
 use ego_fuser::node::{self, NodeOptions};
 use protocol::Role;
 use support::output;
@@ -28,7 +28,8 @@ impl Arguments {
         let EgoConfig { run, models, method, ego: settings, bus, .. } = &config;
         let cav = settings.id.as_ref().context("the configuration names no ego")?;
         models.threads.apply();
-        let ego = Ego::load(&models.weights, *method).map_err(|error| BadInput::new(format!("weights: {error}")))?;
+        let ego = models.load().map_err(EgoError::from).and_then(|weights| Ego::from_weights(&weights, *method));
+        let ego = ego.map_err(|error| BadInput::new(format!("weights: {error}")))?;
         let ego = ego.with_comm_range(config.comm_range_m).with_misbehaviour_detection(settings.trust())?;
         let stop = bus.stop().context("installing signal handlers")?;
         let bus = bus.join(run, Role::Ego, cav)?;

@@ -114,8 +114,10 @@ impl FeatureStore {
             IntensityScale::AUTO => String::new(),
             scale => format!("-intensity{scale}"),
         };
+        let scales = weights.activation_scales()?.map(|scales| scales.sha256_of(is_encoder));
+        let precision = scales.map_or(String::new(), |scales| format!("-int8-{}", &scales[..HASH_DIGITS]));
         let [encoder, data] = [&encoder[..HASH_DIGITS], &data[..HASH_DIGITS]];
-        let name = format!("{encoder}-{data}-{dtype}{scale}-wire{WIRE_VERSION}.maps");
+        let name = format!("{encoder}-{data}-{dtype}{scale}{precision}-wire{WIRE_VERSION}.maps");
         let path = kept.folder.join(name);
         let io = |source| FeatureStoreError::Io { path: path.clone(), source };
         fs::create_dir_all(&kept.folder).map_err(io)?;

@@ -52,13 +52,8 @@ fn evaluate_with(
     let config = EvaluateConfig {
         weights: folder.join("weights.safetensors"),
         method: Some(Method::MAX),
-        pose_source: PoseSourceConfig::Recorded,
         codec,
-        rate: RateConfig::default(),
-        protocol: None,
-        delay_nanos: 0,
-        attack: None,
-        trust: None,
+        ..EvaluateConfig::default()
     };
     let mut evaluator = Evaluator::new(config).unwrap();
     if let Some(stepped) = stepped {

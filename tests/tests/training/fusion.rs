@@ -38,11 +38,7 @@ fn run(config: &TrainConfig) -> (Summary, Ear) {
 
 fn evaluate(weights: PathBuf, scene: &Path, method: Method, dtype: Dtype) -> Vec<EvaluatedFrame> {
     let codec = CodecConfig { dtype, ..CodecConfig::default() };
-    let pose_source = PoseSourceConfig::Recorded;
-    let rate = RateConfig::default();
-    let method = Some(method);
-    let (protocol, delay_nanos, attack, trust) = (None, 0, None, None);
-    let config = EvaluateConfig { weights, method, pose_source, codec, rate, protocol, delay_nanos, attack, trust };
+    let config = EvaluateConfig { weights, method: Some(method), codec, ..EvaluateConfig::default() };
     let mut evaluator = Evaluator::new(config).unwrap();
     let mut frames = Vec::new();
     for scenario in &dataset::open(scene).unwrap().scenarios {

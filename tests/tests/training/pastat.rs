@@ -60,11 +60,8 @@ fn evaluate(weights: &Path, data: &Path, poses: PoseSourceConfig, delay_nanos: u
         method: Some(Method::PASTAT),
         pose_source: poses,
         codec,
-        rate: RateConfig::default(),
-        protocol: None,
         delay_nanos,
-        attack: None,
-        trust: None,
+        ..EvaluateConfig::default()
     };
     let mut evaluator = Evaluator::new(config).unwrap();
     let scenarios = dataset::open(data).unwrap().scenarios;

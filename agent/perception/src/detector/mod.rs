@@ -1,5 +1,6 @@
 //! Detector for inference: from one sweep to the transmitted feature map and boxes.
 
+mod encoder;
 mod error;
 mod output;
 
@@ -14,19 +15,19 @@ use tch::{Device, Kind, Tensor};
 pub use error::DetectorError;
 pub use output::{Encoded, Heads};
 
+use encoder::BevEncoder;
 use output::flat;
 
 use crate::boxes::anchors::Anchors;
 use crate::boxes::decode::{Decoded, decode};
 use crate::crop::Crop;
-use crate::layers::backbone::BevBackbone;
 use crate::layers::head::DetectionHead;
+use crate::int8::ScaleSearch;
 use crate::layers::shrink::{Compressor, Shrink};
 use crate::model_config::{DetectorConfig, YAxis};
-use crate::pillars::batch::PillarGrid;
 use crate::pillars::point_pillars::PointPillars;
 use crate::pillars::projection::PillarProjection;
-use crate::pillars::voxels::Voxeliser;
+use crate::pillars::voxels::{Pillars, Voxeliser};
 use crate::weights::Weights;
 
 /// A trained PointPillars network in its fastest form, for one sweep at a time.
@@ -39,15 +40,11 @@ pub struct Detector {
     sha256: String,
     crop: Crop,
     voxeliser: Voxeliser,
-    pillar_grid: PillarGrid,
-    projection: PillarProjection,
-    backbone: BevBackbone,
-    shrink: Option<Shrink>,
+    encoder: BevEncoder,
     compressor: Option<Compressor>,
     head: DetectionHead,
     anchors: Anchors,
     cropped: Vec<[f32; 4]>,
-    canvas: Vec<f32>,
 }
 
 impl Detector {
@@ -60,7 +57,8 @@ impl Detector {
         Self::from_weights(&weights, &weights.config()?)
     }
 
-    /// Builds the detector that `config` describes from a file already read.
+    /// Builds the detector that `config` describes from a file already read, in integers if it has scales of
+    /// activations.
     ///
     /// # Errors
     /// See [`Self::load`].
@@ -68,28 +66,31 @@ impl Detector {
         let network = VarStore::new(Device::Cpu);
         let pillars = PointPillars::new(&network.root(), config)?;
         weights.copy_into(&network)?;
-        Ok(Self { sha256: weights.sha256().to_owned(), ..Self::from_network(pillars) })
+        let mut detector = Self { sha256: weights.sha256().to_owned(), ..Self::from_network(pillars) };
+        if let Some(scales) = weights.activation_scales()? {
+            detector.encoder = detector.encoder.quantised(&scales).map_err(|error| weights.quantise_error(error))?;
+        }
+        Ok(detector)
     }
 
     /// Uses a network on the CPU, trained or not; its norms are folded into the convolutions.
     #[must_use]
     pub fn from_network(network: PointPillars) -> Self {
-        let pillar_grid = *network.pillar_grid();
-        let projection = PillarProjection::new(&network.encoder);
         tch::no_grad(|| Self {
             sha256: String::new(),
             crop: Crop::for_detector(&network.config),
             voxeliser: Voxeliser::for_detector(&network.config),
-            backbone: network.backbone.folded(),
-            shrink: network.shrink.as_ref().map(Shrink::folded),
+            encoder: BevEncoder::new(
+                *network.pillar_grid(),
+                PillarProjection::new(&network.encoder),
+                network.backbone.folded(),
+                network.shrink.as_ref().map(Shrink::folded),
+            ),
             compressor: network.compressor.as_ref().map(Compressor::folded),
             anchors: Anchors::for_detector(&network.config),
             head: network.head,
             config: network.config,
             cropped: Vec::new(),
-            canvas: vec![0.0; pillar_grid.width * pillar_grid.height * projection.channels()],
-            pillar_grid,
-            projection,
         })
     }
 
@@ -169,27 +170,34 @@ impl Detector {
         &self.crop
     }
 
-    fn encode_within(&mut self, crop: &Crop, cloud: &PointCloud) -> Result<Encoded, DetectorError> {
-        let mut times = StageTimes::start();
+    /// Adds the activations of a sweep to a search for their scales.
+    ///
+    /// # Errors
+    /// Those of the tensor library.
+    pub fn observe(&mut self, cloud: &PointCloud, search: &mut ScaleSearch) -> Result<(), DetectorError> {
+        let crop = self.crop;
+        let pillars = self.pillars(&crop, cloud);
+        let canvas = self.encoder.scatter(&pillars)?;
+        Ok(tch::no_grad(|| self.encoder.observe(&canvas, search))?)
+    }
+
+    /// Pillars of a cropped sweep in the network's frame.
+    fn pillars(&mut self, crop: &Crop, cloud: &PointCloud) -> Pillars {
         self.cropped.clear();
         crop.keep(&cloud.xyzi, &mut self.cropped);
         if self.config.y_axis == YAxis::Right {
             self.cropped.iter_mut().for_each(|point| point[1] = -point[1]);
         }
-        let pillars = self.voxeliser.voxelise(&self.cropped);
+        self.voxeliser.voxelise(&self.cropped)
+    }
+
+    fn encode_within(&mut self, crop: &Crop, cloud: &PointCloud) -> Result<Encoded, DetectorError> {
+        let mut times = StageTimes::start();
+        let pillars = self.pillars(crop, cloud);
         times.lap("voxelise");
-        self.canvas.fill(0.0);
-        self.projection.scatter(&pillars, &self.pillar_grid, &mut self.canvas);
-        let (height, width) = (self.pillar_grid.height as i64, self.pillar_grid.width as i64);
-        let canvas = Tensor::f_from_slice(&self.canvas)?.f_view([1, height, width, -1])?.f_permute([0, 3, 1, 2])?;
+        let canvas = self.encoder.scatter(&pillars)?;
         times.lap("pillars");
-        let features = tch::no_grad(|| {
-            let wide = self.backbone.forward(&canvas, false);
-            match &self.shrink {
-                Some(shrink) => shrink.forward_contiguous(&wide),
-                None => wide.f_contiguous(),
-            }
-        })?;
+        let features = tch::no_grad(|| self.encoder.features(&canvas))?;
         times.lap("backbone");
         Ok(Encoded { features, points: self.cropped.len(), pillars: pillars.len(), times: times.into_timings() })
     }

@@ -89,6 +89,16 @@ impl BevBackbone {
         if levels.len() == 1 { levels.remove(0) } else { Tensor::cat(&levels, 1) }
     }
 
+    /// Layers of every level and up-sampling layers; `None` with residual blocks.
+    pub(crate) fn plain_layers(&self) -> Option<(Vec<&[ConvLayer]>, &[ConvLayer])> {
+        let mut levels = Vec::with_capacity(self.blocks.len());
+        for block in &self.blocks {
+            let Block::Plain(layers) = block else { return None };
+            levels.push(layers.as_slice());
+        }
+        Some((levels, &self.deblocks))
+    }
+
     /// The same backbone for inference, norms folded into the convolutions.
     #[must_use]
     pub fn folded(&self) -> Self {

@@ -3,6 +3,8 @@
 use tch::nn::{self, BatchNormConfig, Init};
 use tch::{TchError, Tensor};
 
+use crate::int8::{ConvGeometry, Int8Convolution, LayerFormat, Quantisation, Scale};
+
 /// Epsilon of every batch norm of PointPillars.
 pub(crate) const NORM_EPS: f64 = 1e-3;
 /// Weight of a new batch in the running statistics of PointPillars.
@@ -192,6 +194,28 @@ impl ConvLayer {
         rows.f_view([1, kernel[0], height, width])
     }
 
+    /// The folded layer in integers, see [`Int8Convolution`].
+    ///
+    /// # Errors
+    /// Those of the tensor library.
+    pub(crate) fn int8(&self, input: Quantisation, output: Option<Scale>) -> Result<Int8Convolution, TchError> {
+        let Self { weight, bias, stride, padding, relu, .. } = self;
+        let format = LayerFormat { input, output, relu: *relu };
+        let (weight, bias, geometry) = match self.direction {
+            Direction::Down => {
+                let geometry = ConvGeometry { stride: *stride, padding: *padding, upsampling: 1 };
+                (weight.f_contiguous()?, bias.as_ref().map(Tensor::shallow_clone), geometry)
+            }
+            Direction::Up => {
+                let (input, output, edge, _) = weight.size4()?;
+                let rows = weight.f_permute([2, 3, 1, 0])?.f_reshape([edge * edge * output, input, 1, 1])?;
+                let bias = bias.as_ref().map(|bias| bias.f_repeat([edge * edge])).transpose()?;
+                (rows, bias, ConvGeometry { stride: 1, padding: 0, upsampling: edge })
+            }
+        };
+        Int8Convolution::new(&weight, bias.as_ref(), geometry, format)
+    }
+
     /// The same layer for inference: the norm's running statistics are folded into weight and bias, which saves one
     /// pass over the map; weights are channels-last, as the maps are.
     #[must_use]
@@ -212,9 +236,37 @@ impl ConvLayer {
     }
 }
 
+/// A map `[1, C, H, W]` whose channels are innermost in memory, contiguous: one transposition, which the library does
+/// several times faster between two dimensions than between four.
+///
+/// # Errors
+/// Those of the tensor library.
+pub(crate) fn contiguous_map(map: &Tensor) -> Result<Tensor, TchError> {
+    let (batch, channels, height, width) = map.size4()?;
+    if batch != 1 {
+        return map.f_contiguous();
+    }
+    let cells = map.f_permute([0, 2, 3, 1])?.f_reshape([height * width, channels])?;
+    cells.f_tr()?.f_contiguous()?.f_view([1, channels, height, width])
+}
+
 /// The same values with the channels innermost in memory.
 pub fn channels_last(x: &Tensor) -> Tensor {
     x.permute([0, 2, 3, 1]).contiguous().permute([0, 3, 1, 2])
+}
+
+/// [`channels_last`] of one contiguous map `[1, C, H, W]`, by one transposition like [`contiguous_map`].
+///
+/// # Errors
+/// Those of the tensor library.
+pub fn channels_last_map(map: &Tensor) -> Result<Tensor, TchError> {
+    let (batch, channels, height, width) = map.size4()?;
+    let cells = map.f_permute([0, 2, 3, 1])?;
+    if batch != 1 || !map.is_contiguous() {
+        return cells.f_contiguous()?.f_permute([0, 3, 1, 2]);
+    }
+    let cells = map.f_view([channels, height * width])?.f_tr()?.f_contiguous()?;
+    cells.f_view([1, height, width, channels])?.f_permute([0, 3, 1, 2])
 }
 
 #[cfg(test)]

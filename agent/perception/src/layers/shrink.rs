@@ -29,6 +29,11 @@ impl Shrink {
         Self { layers }
     }
 
+    /// Its layers, in order.
+    pub(crate) fn layers(&self) -> &[ConvLayer] {
+        &self.layers
+    }
+
     /// `[N, C_in, H, W]` to `[N, C, H', W']`.
     pub fn forward(&self, x: &Tensor, train: bool) -> Tensor {
         chain(&self.layers, x, train)

@@ -2,6 +2,7 @@
 
 use tch::{Kind, Tensor};
 
+use crate::int8::Quantisation;
 use crate::pillars::batch::{POINT_FEATURES, PillarGrid, mean_xyz};
 use crate::pillars::encoder::PillarEncoder;
 use crate::pillars::voxels::Pillars;
@@ -81,6 +82,28 @@ impl PillarProjection {
             let center = pillar_grid.center_m(coord);
             let has_free_slot = points.len() < pillar_grid.max_points;
             self.pillar(points, center, has_free_slot, &mut canvas[cell..cell + self.channels]);
+        }
+    }
+
+    /// The same in quantised values.
+    ///
+    /// # Panics
+    /// When the canvas is smaller than the pillar grid.
+    pub fn scatter_quantised(
+        &self,
+        pillars: &Pillars,
+        pillar_grid: &PillarGrid,
+        quantisation: Quantisation,
+        canvas: &mut [u8],
+    ) {
+        let mut features = vec![0.0; self.channels];
+        for (points, coord) in pillars.iter() {
+            let cell = pillar_grid.cell(coord) * self.channels;
+            let has_free_slot = points.len() < pillar_grid.max_points;
+            self.pillar(points, pillar_grid.center_m(coord), has_free_slot, &mut features);
+            for (steps, &value) in canvas[cell..cell + self.channels].iter_mut().zip(&features) {
+                *steps = quantisation.quantise_value(value);
+            }
         }
     }
 

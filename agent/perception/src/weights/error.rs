@@ -6,6 +6,7 @@ use std::path::PathBuf;
 use safetensors::tensor::{Dtype, SafeTensorError};
 use tch::TchError;
 
+use crate::int8::QuantiseError;
 use crate::torch_error::first_line;
 
 /// Error of reading or writing parameters. Every message begins with the file.
@@ -58,6 +59,14 @@ pub enum WeightsError {
         key: String,
         /// Error of the JSON.
         source: serde_json::Error,
+    },
+    /// The weights cannot be quantised.
+    #[error("{}: int8: {source}", path.display())]
+    Quantise {
+        /// Path of the file.
+        path: PathBuf,
+        /// Missing scale, or error of the tensor library.
+        source: QuantiseError,
     },
     /// The network has a parameter that the file lacks.
     #[error("{}: tensor {name:?} is missing (the network expects shape {expected:?})", path.display())]

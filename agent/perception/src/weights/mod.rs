@@ -19,6 +19,8 @@ use support::bounded_file;
 use tch::Tensor;
 use tch::nn::VarStore;
 
+use crate::int8::{ActivationScales, InferencePrecision, QuantiseError, SCALES_KEY};
+
 pub use annotate::annotate;
 pub use error::WeightsError;
 pub use save::{Precision, save};
@@ -152,6 +154,28 @@ impl Weights {
             key: key.to_owned(),
             source,
         })
+    }
+
+    /// Scales of the activations for 8-bit inference; `None` if the file has none, or if it is for floating point.
+    ///
+    /// # Errors
+    /// [`WeightsError::Metadata`] when the JSON has another form.
+    pub fn activation_scales(&self) -> Result<Option<ActivationScales>, WeightsError> {
+        self.metadata.contains_key(SCALES_KEY).then(|| self.metadata_json(SCALES_KEY)).transpose()
+    }
+
+    /// The same weights for a number format: in [`InferencePrecision::Float`] the scales of activations are ignored.
+    #[must_use]
+    pub fn with_precision(mut self, precision: InferencePrecision) -> Self {
+        if precision == InferencePrecision::Float {
+            self.metadata.remove(SCALES_KEY);
+        }
+        self
+    }
+
+    /// The error of quantising these weights.
+    pub fn quantise_error(&self, source: impl Into<QuantiseError>) -> WeightsError {
+        WeightsError::Quantise { path: self.path.clone(), source: source.into() }
     }
 
     /// Copies the parameters into a network; tensors that the network does not have are ignored.

@@ -14,6 +14,7 @@ use fusion::Exchange;
 use link::LinkConfig;
 use localization::pose_source::PoseSourceConfig;
 use perception::model_config::DetectorConfig;
+use perception::int8::InferencePrecision;
 use perception::weights::Weights;
 use protocol::text::hex;
 use protocol::{Counts, DropReason, Dtype, Stream, Topic};
@@ -52,6 +53,9 @@ pub struct CellKey {
     pub poses_sha256: Vec<String>,
     /// SHA-256 of the weights.
     pub weights_sha256: String,
+    /// Number format in which networks are computed.
+    #[serde(default)]
+    pub precision: InferencePrecision,
     /// SHA-256 over the part of the data that is evaluated ([`dataset::content_sha256`]).
     pub data_sha256: String,
     /// SHA-256 of the program: results of another one are not reused.
@@ -167,6 +171,7 @@ impl Hashes {
             poses,
             poses_sha256,
             weights_sha256,
+            precision: experiment.precision,
             data_sha256: self.data_sha256.clone(),
             program_sha256: self.of(&program)?,
         })
@@ -182,6 +187,7 @@ pub(super) fn options(experiment: &Experiment, point: &Point, maps: &Path) -> Re
     Ok(EvaluationOptions {
         dataset: experiment.dataset.clone(),
         weights,
+        precision: experiment.precision,
         pose_source: point.poses(experiment),
         codec: point.codec(config.feature_grid(), channels),
         rate: point.rate(),

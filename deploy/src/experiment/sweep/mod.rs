@@ -233,6 +233,7 @@ impl Sweep {
         for file in files {
             let refused = |error: EvaluateError| SweepError::Evaluation(Box::new(error.into()));
             let weights = perception::weights::Weights::load(&file).map_err(|error| refused(error.into()))?;
+            let weights = weights.with_precision(self.experiment.precision);
             let bar = progress::bar(0, "sweeps encoded");
             let kept = cell::kept_maps(&self.experiment, &self.maps());
             let store = FeatureStore::open(&kept, &weights, &self.all, &mut |stored, all| {

@@ -10,6 +10,7 @@ use ego_fuser_offline::evaluation::stepped::ComputeTimes;
 use fusion::Method;
 use link::LinkConfig;
 use localization::pose_source::{NoiseMode, PoseSourceConfig};
+use perception::int8::InferencePrecision;
 use protocol::Dtype;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -42,6 +43,9 @@ pub struct Experiment {
     pub protocol: ProtocolConfig,
     /// Weights, or a folder with a file `*-METHOD.safetensors` for each method, relative to the file.
     pub weights: PathBuf,
+    /// Number format in which networks are computed.
+    #[serde(default)]
+    pub precision: InferencePrecision,
     /// Pose source, unless the grid has pose noise.
     #[serde(default)]
     pub poses: PoseSourceConfig,

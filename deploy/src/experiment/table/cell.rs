@@ -9,6 +9,7 @@ use ego_fuser::misbehaviour::MisbehaviourConfig;
 use fusion::Method;
 use localization::pose_source::PoseSourceConfig;
 use protocol::text::hex;
+use perception::int8::InferencePrecision;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use support::atomic_file;
@@ -24,6 +25,9 @@ pub struct CellKey {
     pub method: Method,
     /// SHA-256 of its weights.
     pub weights_sha256: String,
+    /// Number format in which networks are computed.
+    #[serde(default)]
+    pub precision: InferencePrecision,
     /// SHA-256 over the contents of the data ([`dataset::content_sha256`]).
     pub data_sha256: String,
     /// Pose source.

@@ -148,6 +148,7 @@ impl Run<'_> {
         let key = CellKey {
             method: row.method,
             weights_sha256: cell::sha256(weights)?,
+            precision: self.spec.precision,
             data_sha256: self.data_sha256.clone(),
             poses_sha256: cell::pose_files(&poses)?,
             poses: poses.clone(),
@@ -169,6 +170,7 @@ impl Run<'_> {
         let options = EvaluationOptions {
             dataset: self.spec.dataset.clone(),
             weights: weights.to_owned(),
+            precision: self.spec.precision,
             pose_source: poses,
             codec: self.spec.codec(),
             rate: RateConfig::default(),

@@ -7,6 +7,7 @@ use bus::config_file;
 use dataset::evaluation_protocol::ProtocolConfig;
 use fusion::Method;
 use localization::pose_source::PoseSourceConfig;
+use perception::int8::InferencePrecision;
 use protocol::{CodecConfig, Dtype};
 use schemars::JsonSchema;
 use serde::Deserialize;
@@ -26,6 +27,9 @@ pub struct TableSpec {
     /// Folder with a file `*-METHOD.safetensors` for each method, for rows that name no weights.
     #[serde(default)]
     pub weights: Option<PathBuf>,
+    /// Number format in which networks are computed.
+    #[serde(default)]
+    pub precision: InferencePrecision,
     /// Number format of transmitted feature values.
     #[serde(default = "half")]
     pub dtype: Dtype,

@@ -157,6 +157,7 @@ mod tests {
         let key = CellKey {
             method,
             weights_sha256: format!("{at_50}"),
+            precision: Default::default(),
             data_sha256: "d".into(),
             poses: PoseSourceConfig::Recorded,
             poses_sha256: vec![],

@@ -2,7 +2,9 @@
 //! Training and the ego run the same code.
 
 use std::borrow::Cow;
+use std::cell::RefCell;
 
+use perception::int8::ScaleSearch;
 use perception::model_config::{ConfigError, DetectorConfig, YAxis};
 use perception::weights::{Weights, WeightsError};
 use protocol::{BevGrid, Pose};
@@ -45,6 +47,8 @@ pub struct FusionStage {
     grid: BevGrid,
     /// Handedness of the frame of the feature maps.
     y_axis: YAxis,
+    /// Search for the scales of activations, while it is under way.
+    search: Option<RefCell<ScaleSearch>>,
 }
 
 impl FusionStage {
@@ -67,7 +71,7 @@ impl FusionStage {
         let requirements = config.requirements();
         let classes = requirements.history.full_resolution.then(|| Classes::under(path, sizes));
         let (grid, y_axis) = (detector.feature_grid(), detector.y_axis);
-        Ok(Self { config: config.clone(), requirements, fusion, mixing, classes, grid, y_axis })
+        Ok(Self { config: config.clone(), requirements, fusion, mixing, classes, grid, y_axis, search: None })
     }
 
     /// The fusion of a weights file, or the one of `method` where it differs and has no parameters.
@@ -81,6 +85,9 @@ impl FusionStage {
         weights.copy_some_into(&variables, |name| name != channel_mixing::WEIGHT || weights.contains(name))?;
         if !weights.contains(channel_mixing::WEIGHT) {
             stage.mixing = None;
+        }
+        if let Some(scales) = weights.activation_scales()? {
+            tch::no_grad(|| stage.fusion.quantise(&scales)).map_err(|error| weights.quantise_error(error))?;
         }
         Ok(stage)
     }
@@ -233,7 +240,20 @@ impl FusionStage {
     /// # Errors
     /// [`WarpError::Torch`] when the tensor library reports an error.
     pub fn fuse(&self, maps: &AlignedMaps) -> Result<FusionOutput, WarpError> {
+        if let Some(search) = &self.search {
+            self.fusion.observe(maps, &mut search.borrow_mut())?;
+        }
         Ok(self.fusion.fuse(maps)?)
+    }
+
+    /// Searches the scales of activations in all that is fused from here on.
+    pub fn start_scale_search(&mut self) {
+        self.search = Some(RefCell::default());
+    }
+
+    /// Ends the search; `None` if none was started.
+    pub fn take_scale_search(&mut self) -> Option<ScaleSearch> {
+        self.search.take().map(RefCell::into_inner)
     }
 
     /// Metadata in the frame of the network: a mirrored network has mirrored poses.

@@ -16,6 +16,7 @@ mod spatial_alignment;
 mod temporal_encoding;
 mod transformer;
 
+use perception::int8::{ActivationScales, QuantiseError, ScaleSearch};
 use perception::model_config::{ConfigError, DetectorConfig};
 use tch::{TchError, Tensor, nn};
 
@@ -104,8 +105,9 @@ impl Pastat {
     }
 }
 
-impl Fusion for Pastat {
-    fn fuse(&self, maps: &AlignedMaps) -> Result<FusionOutput, TchError> {
+impl Pastat {
+    /// The fused map before its refinement, `[1, C, H, W]`, and the corrections of the poses.
+    fn unrefined(&self, maps: &AlignedMaps) -> Result<(Tensor, Option<Tensor>), TchError> {
         let coarse = self.coarse_alignment.pick(maps)?; // Eq. 2
         let confidences = self.confidence_embedding.embed(&coarse.origins)?; // Eq. 7
         let patches = self.patches.flatten(&coarse)?;
@@ -117,14 +119,30 @@ impl Fusion for Pastat {
         if let Some(memory) = &self.temporal_memory {
             fused = memory.blend(fused, maps, &coarse, &fine, &context)?;
         }
-        fused = cropped(&self.decoder.changed(&fused, &context)?, &maps.warped.features)?;
-        if let Some(refinement) = &self.map_refinement {
-            fused = refinement.forward(&fused, maps.is_training)?;
+        let corrections = fine.corrections.map(|corrections| coarse.among_all(&corrections)).transpose()?;
+        Ok((cropped(&self.decoder.changed(&fused, &context)?, &maps.warped.features)?, corrections))
+    }
+}
+
+impl Fusion for Pastat {
+    fn fuse(&self, maps: &AlignedMaps) -> Result<FusionOutput, TchError> {
+        let (fused, corrections) = self.unrefined(maps)?;
+        let refined = match &self.map_refinement {
+            Some(refinement) => refinement.forward(&fused, maps.is_training)?,
+            None => fused,
+        };
+        Ok(FusionOutput { map: refined.f_squeeze_dim(0)?.f_to_kind(maps.warped.features.kind())?, corrections })
+    }
+
+    fn observe(&self, maps: &AlignedMaps, search: &mut ScaleSearch) -> Result<(), TchError> {
+        match &self.map_refinement {
+            Some(refinement) => refinement.observe(&self.unrefined(maps)?.0, search),
+            None => Ok(()),
         }
-        Ok(FusionOutput {
-            map: fused.f_squeeze_dim(0)?.f_to_kind(maps.warped.features.kind())?,
-            corrections: fine.corrections.map(|corrections| coarse.among_all(&corrections)).transpose()?,
-        })
+    }
+
+    fn quantise(&mut self, scales: &ActivationScales) -> Result<(), QuantiseError> {
+        self.map_refinement.as_mut().map_or(Ok(()), |refinement| refinement.quantise(scales))
     }
 }
 

@@ -3,7 +3,6 @@
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
-use agent::rate::RateConfig;
 use anyhow::Result;
 use dataset::evaluation_protocol::{EvaluationProtocol, ProtocolConfig};
 use dataset::frame::Frame;
@@ -12,9 +11,8 @@ use dataset::{self, Dataset, IntensityScale, LeftOut, LoadOptions, OpenOptions, 
 use ego_fuser_offline::evaluation::{EvaluateConfig, EvaluatedFrame, Evaluator};
 use ego_fuser_offline::multi_scale::{MULTI_SCALE_KIND, OfflineDetector};
 use fusion::Method;
-use localization::pose_source::PoseSourceConfig;
+use perception::int8::InferencePrecision;
 use perception::weights::{KIND_KEY, Weights};
-use protocol::CodecConfig;
 use serde_json::json;
 use support::cli::BadInput;
 use support::cli::Outcome;
@@ -40,6 +38,9 @@ pub(crate) struct Arguments {
     /// Weights of encoder and head.
     #[arg(long, value_name = "FILE")]
     weights: PathBuf,
+    /// Number format in which networks are computed.
+    #[arg(long, value_enum, default_value_t)]
+    precision: InferencePrecision,
     /// Methods, one after another; none named: that of the weights.
     #[arg(long, num_args = 1..)]
     method: Vec<Method>,
@@ -73,13 +74,9 @@ impl Arguments {
             let config = |data: &Data| EvaluateConfig {
                 protocol: Some(data.protocol.clone()),
                 weights: self.weights.clone(),
+                precision: self.precision,
                 method,
-                pose_source: PoseSourceConfig::Recorded,
-                codec: CodecConfig::default(),
-                rate: RateConfig::default(),
-                delay_nanos: 0,
-                attack: None,
-                trust: None,
+                ..EvaluateConfig::default()
             };
             let (row, lost) = evaluate(&config, &data, self.frames.unwrap_or(usize::MAX), self.json)?;
             left_out.merge(&lost);

@@ -3,6 +3,7 @@
 mod align;
 mod alignment_error;
 mod eval;
+mod quantise;
 mod train;
 
 use std::path::PathBuf;
@@ -21,6 +22,8 @@ pub(crate) enum Command {
     Eval(eval::Arguments),
     /// Measure the part of pose offsets that a method's own alignment leaves.
     AlignmentError(alignment_error::Arguments),
+    /// Prepare weights for 8-bit inference.
+    Quantise(quantise::Arguments),
     /// Train a method on scenes.
     Train(Box<train::Arguments>),
 }
@@ -33,6 +36,7 @@ impl Command {
             Self::Align(arguments) => arguments.run()?,
             Self::Eval(arguments) => return arguments.run(),
             Self::AlignmentError(arguments) => arguments.run()?,
+            Self::Quantise(arguments) => arguments.run()?,
             Self::Train(arguments) => arguments.run()?,
         }
         Ok(Outcome::Done)

@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use perception::int8::InferencePrecision;
 use perception::weights::Weights;
 
 use super::config::TrainConfig;
@@ -27,8 +28,8 @@ impl<'a> FrozenEncoder<'a> {
                 let _ = variable.f_set_requires_grad(false)?;
             }
         }
-        let weights = Arc::new(Weights::load(init).map_err(ModelError::from)?);
-        Ok(Some(Self { kept, weights }))
+        let weights = Weights::load(init).map_err(ModelError::from)?.with_precision(InferencePrecision::Float);
+        Ok(Some(Self { kept, weights: Arc::new(weights) }))
     }
 
     /// The maps of all sweeps of some scenes; missing ones are encoded now.

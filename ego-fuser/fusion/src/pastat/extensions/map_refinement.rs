@@ -2,6 +2,10 @@
 //!
 //! Measured gain: not measured separately; every training in the tables has it.
 
+use perception::int8::{
+    ActivationScales, ConvGeometry, Int8Convolution, LayerFormat, Quantisation, QuantiseError, ScaleSearch,
+};
+use perception::layers::convolution::channels_last_map;
 use tch::nn::{self, Init};
 use tch::{Kind, TchError, Tensor};
 
@@ -15,7 +19,20 @@ use crate::pastat::precision::{convolve, fastest};
 #[derive(Debug)]
 pub(crate) struct MapRefinement {
     convolutions: [nn::Conv2D; 2],
+    int8: Option<Int8Refinement>,
 }
+
+/// The same convolutions in 8-bit integers.
+#[derive(Debug)]
+struct Int8Refinement {
+    input: Quantisation,
+    convolutions: [Int8Convolution; 2],
+}
+
+/// Name of the input among the activations.
+const INPUT: &str = "fusion.refine.input";
+/// Name of the map between the convolutions.
+const HIDDEN: &str = "fusion.refine.hidden";
 
 impl MapRefinement {
     /// Its variables are `refine.*` below `path`; `hidden` are the channels between its two convolutions.
@@ -28,13 +45,39 @@ impl MapRefinement {
                 nn::conv2d(&path / "conv0", channels, hidden, 3, around),
                 nn::conv2d(&path / "conv1", hidden, channels, 3, neutral),
             ],
+            int8: None,
         }
     }
 
     /// `[1, C, H, W]` of a fused map of that shape.
     pub(crate) fn forward(&self, fused: &Tensor, train: bool) -> Result<Tensor, TchError> {
+        if let (Some(int8), false) = (&self.int8, train) {
+            return int8.change(fused)?.f_add_(fused);
+        }
         let kind = if train { Kind::Float } else { fastest(fused.device()) };
         self.change(fused, kind)?.f_add_(fused)
+    }
+
+    /// Adds the activations for a fused map `[1, C, H, W]`.
+    pub(crate) fn observe(&self, fused: &Tensor, search: &mut ScaleSearch) -> Result<(), TchError> {
+        search.observe(INPUT, fused)?;
+        search.observe(HIDDEN, &convolve(&self.convolutions[0], fused)?.f_relu_()?)
+    }
+
+    /// Computes in integers from here on, except in training.
+    pub(crate) fn quantise(&mut self, scales: &ActivationScales) -> Result<(), QuantiseError> {
+        let (input, hidden) = (scales.get(INPUT)?, scales.get(HIDDEN)?);
+        let [first, second] = &self.convolutions;
+        let quantised = |convolution: &nn::Conv2D, format| {
+            let geometry = ConvGeometry::size_preserving(3);
+            Int8Convolution::new(&convolution.ws, convolution.bs.as_ref(), geometry, format)
+        };
+        let convolutions = [
+            quantised(first, LayerFormat { input, output: Some(hidden.scale), relu: true })?,
+            quantised(second, LayerFormat { input: hidden, output: None, relu: false })?,
+        ];
+        self.int8 = Some(Int8Refinement { input, convolutions });
+        Ok(())
     }
 
     /// Additive change, computed in `kind`.
@@ -42,6 +85,15 @@ impl MapRefinement {
         let [first, second] = &self.convolutions;
         let hidden = convolve(first, &fused.f_to_kind(kind)?)?.f_relu_()?;
         convolve(second, &hidden)?.f_to_kind(fused.kind())
+    }
+}
+
+impl Int8Refinement {
+    /// Additive change of a fused map `[1, C, H, W]`, channels innermost in memory.
+    fn change(&self, fused: &Tensor) -> Result<Tensor, TchError> {
+        let [first, second] = &self.convolutions;
+        let input = channels_last_map(&self.input.quantise(fused)?)?;
+        second.forward(&first.forward(&input)?)
     }
 }
 

@@ -1,0 +1,97 @@
+//! Canvas, backbone and shrink of a detector, in floating point or in 8-bit integers.
+
+use tch::{TchError, Tensor};
+
+use crate::int8::{
+    ActivationScales, CANVAS, Int8Backbone, Quantisation, QuantiseError, ScaleSearch, observe_backbone,
+};
+use crate::layers::backbone::BevBackbone;
+use crate::layers::shrink::Shrink;
+use crate::pillars::batch::PillarGrid;
+use crate::pillars::projection::PillarProjection;
+use crate::pillars::voxels::Pillars;
+
+/// From pillars to the feature map.
+#[derive(Debug)]
+pub(super) struct BevEncoder {
+    pillar_grid: PillarGrid,
+    projection: PillarProjection,
+    layers: Layers,
+}
+
+#[derive(Debug)]
+enum Layers {
+    Float { canvas: Vec<f32>, backbone: BevBackbone, shrink: Option<Shrink> },
+    Int8 { canvas: Vec<u8>, quantisation: Quantisation, backbone: Int8Backbone },
+}
+
+/// What pillars are written to, `[1, C_pillar, H, W]` with the channels innermost in memory.
+#[derive(Debug)]
+pub(super) struct Canvas(Tensor);
+
+impl BevEncoder {
+    /// An encoder of folded layers in floating point.
+    pub(super) fn new(
+        pillar_grid: PillarGrid,
+        projection: PillarProjection,
+        backbone: BevBackbone,
+        shrink: Option<Shrink>,
+    ) -> Self {
+        let canvas = vec![0.0; canvas_len(&pillar_grid, &projection)];
+        Self { pillar_grid, projection, layers: Layers::Float { canvas, backbone, shrink } }
+    }
+
+    /// The same in integers, if its layers can be quantised.
+    pub(super) fn quantised(self, scales: &ActivationScales) -> Result<Self, QuantiseError> {
+        let Layers::Float { backbone, shrink, .. } = &self.layers else { return Ok(self) };
+        let Some(backbone) = Int8Backbone::new(backbone, shrink.as_ref(), scales)? else { return Ok(self) };
+        let canvas = vec![0; canvas_len(&self.pillar_grid, &self.projection)];
+        let layers = Layers::Int8 { canvas, quantisation: scales.get(CANVAS)?, backbone };
+        Ok(Self { layers, ..self })
+    }
+
+    /// Writes pillars to the canvas.
+    pub(super) fn scatter(&mut self, pillars: &Pillars) -> Result<Canvas, TchError> {
+        let Self { pillar_grid, projection, layers } = self;
+        let flat = match layers {
+            Layers::Float { canvas, .. } => {
+                canvas.fill(0.0);
+                projection.scatter(pillars, pillar_grid, canvas);
+                Tensor::f_from_slice(canvas)
+            }
+            Layers::Int8 { canvas, quantisation, .. } => {
+                canvas.fill(0);
+                projection.scatter_quantised(pillars, pillar_grid, *quantisation, canvas);
+                Tensor::f_from_slice(canvas)
+            }
+        };
+        let [height, width] = [pillar_grid.height, pillar_grid.width].map(|size| size as i64);
+        Ok(Canvas(flat?.f_view([1, height, width, -1])?.f_permute([0, 3, 1, 2])?))
+    }
+
+    /// Feature map `[1, C, H', W']` of a canvas, contiguous.
+    pub(super) fn features(&self, canvas: &Canvas) -> Result<Tensor, TchError> {
+        match &self.layers {
+            Layers::Float { backbone, shrink, .. } => {
+                let wide = backbone.forward(&canvas.0, false);
+                match shrink {
+                    Some(shrink) => shrink.forward_contiguous(&wide),
+                    None => wide.f_contiguous(),
+                }
+            }
+            Layers::Int8 { backbone, .. } => backbone.forward(&canvas.0),
+        }
+    }
+
+    /// Adds the activations of a canvas to a search for their scales; nothing if the layers are in integers already.
+    pub(super) fn observe(&self, canvas: &Canvas, search: &mut ScaleSearch) -> Result<(), TchError> {
+        match &self.layers {
+            Layers::Float { backbone, shrink, .. } => observe_backbone(backbone, shrink.as_ref(), &canvas.0, search),
+            Layers::Int8 { .. } => Ok(()),
+        }
+    }
+}
+
+fn canvas_len(pillar_grid: &PillarGrid, projection: &PillarProjection) -> usize {
+    pillar_grid.width * pillar_grid.height * projection.channels()
+}

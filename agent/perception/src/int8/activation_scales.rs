@@ -1,0 +1,64 @@
+//! Scales of the activations of a network, as its weights file stores them.
+
+use std::collections::BTreeMap;
+
+use protocol::text::hex;
+use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
+
+use super::scale::Quantisation;
+
+/// Metadata key of the scales in a weights file.
+pub const SCALES_KEY: &str = "activation_scales";
+
+/// Quantisation of each activation, by name: that of the layer whose output it is, below the prefixes of the weights.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(transparent)]
+pub struct ActivationScales(BTreeMap<String, Quantisation>);
+
+/// An activation whose scale is needed and missing.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("no scale of activation {name:?}; there are those of {known:?}")]
+pub struct MissingScale {
+    /// Name of the activation.
+    name: String,
+    /// Names of those that are there.
+    known: Vec<String>,
+}
+
+impl ActivationScales {
+    pub(super) fn new(scales: BTreeMap<String, Quantisation>) -> Self {
+        Self(scales)
+    }
+
+    /// Quantisation of an activation.
+    ///
+    /// # Errors
+    /// [`MissingScale`] if it was not observed.
+    pub fn get(&self, name: &str) -> Result<Quantisation, MissingScale> {
+        let missing = || MissingScale { name: name.to_owned(), known: self.0.keys().cloned().collect() };
+        self.0.get(name).copied().ok_or_else(missing)
+    }
+
+    /// SHA-256 over the scales of the activations whose name is `wanted`.
+    #[must_use]
+    pub fn sha256_of(&self, wanted: impl Fn(&str) -> bool) -> String {
+        let mut hash = Sha256::new();
+        for (name, Quantisation { scale, zero_point }) in self.0.iter().filter(|(name, _)| wanted(name)) {
+            hash.update(format!("{name} {} {zero_point}\n", scale.exponent));
+        }
+        hex(&hash.finalize())
+    }
+
+    /// Number of activations.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.0.len()
+    }
+
+    /// True if there is none.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.0.is_empty()
+    }
+}

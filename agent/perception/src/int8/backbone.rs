@@ -1,0 +1,131 @@
+//! Quantised backbone and shrink: canvas to feature map.
+
+use tch::{TchError, Tensor};
+
+use super::activation_scales::{ActivationScales, MissingScale};
+use super::convolution::Int8Convolution;
+use super::scale_search::ScaleSearch;
+use crate::layers::backbone::BevBackbone;
+use crate::layers::convolution::{ConvLayer, contiguous_map};
+use crate::layers::shrink::Shrink;
+
+/// Name of the canvas among the activations.
+pub const CANVAS: &str = "pillar_vfe.canvas";
+/// Name of the up-sampled levels, which are concatenated and therefore share a scale.
+const UPSAMPLED: &str = "backbone.upsampled";
+
+/// Error of quantising a network.
+#[derive(Debug, thiserror::Error)]
+pub enum QuantiseError {
+    /// The weights file lacks the scale of an activation.
+    #[error(transparent)]
+    Scale(#[from] MissingScale),
+    /// The tensor library failed.
+    #[error("tensor library: {0}")]
+    Tensor(#[from] TchError),
+}
+
+/// Backbone of plain blocks with a shrink layer, in integers.
+#[derive(Debug)]
+pub struct Int8Backbone {
+    blocks: Vec<Vec<Int8Convolution>>,
+    deblocks: Vec<Int8Convolution>,
+    /// The last of them gives `f32`.
+    shrink: Vec<Int8Convolution>,
+}
+
+impl Int8Backbone {
+    /// Quantises a folded backbone and its shrink layers; `None` if it has residual blocks or no shrink layer, which
+    /// stay in floating point.
+    ///
+    /// # Errors
+    /// [`QuantiseError`] names the activation whose scale is missing.
+    pub fn new(
+        backbone: &BevBackbone,
+        shrink: Option<&Shrink>,
+        scales: &ActivationScales,
+    ) -> Result<Option<Self>, QuantiseError> {
+        let (Some((levels, up)), Some(shrink)) = (backbone.plain_layers(), shrink) else { return Ok(None) };
+        let mut input = scales.get(CANVAS)?;
+        let (mut blocks, mut deblocks) = (Vec::new(), Vec::new());
+        let upsampled = scales.get(UPSAMPLED)?;
+        for (level, (layers, deblock)) in levels.into_iter().zip(up).enumerate() {
+            let mut block = Vec::new();
+            for (position, layer) in layers.iter().enumerate() {
+                let output = scales.get(&block_activation(level, position))?;
+                block.push(layer.int8(input, Some(output.scale))?);
+                input = output;
+            }
+            blocks.push(block);
+            deblocks.push(deblock.int8(input, Some(upsampled.scale))?);
+        }
+        let mut input = upsampled;
+        let mut shrunk = Vec::new();
+        let count = shrink.layers().len();
+        for (position, layer) in shrink.layers().iter().enumerate() {
+            let is_last = position + 1 == count;
+            let output = if is_last { None } else { Some(scales.get(&shrink_activation(position))?) };
+            shrunk.push(layer.int8(input, output.map(|output| output.scale))?);
+            input = output.unwrap_or(input);
+        }
+        Ok(Some(Self { blocks, deblocks, shrink: shrunk }))
+    }
+
+    /// Feature map `[1, C, H', W']`, `f32` and contiguous, of the quantised canvas `[1, C_pillar, H, W]`.
+    ///
+    /// # Errors
+    /// Those of the tensor library.
+    pub fn forward(&self, canvas: &Tensor) -> Result<Tensor, TchError> {
+        let mut x = canvas.shallow_clone();
+        let mut levels = Vec::with_capacity(self.blocks.len());
+        for (block, deblock) in self.blocks.iter().zip(&self.deblocks) {
+            x = through(block, x)?;
+            levels.push(deblock.forward(&x)?);
+        }
+        contiguous_map(&through(&self.shrink, Tensor::f_cat(&levels, 1)?)?)
+    }
+}
+
+fn through(layers: &[Int8Convolution], x: Tensor) -> Result<Tensor, TchError> {
+    layers.iter().try_fold(x, |x, layer| layer.forward(&x))
+}
+
+fn block_activation(level: usize, position: usize) -> String {
+    format!("backbone.blocks.{level}.{position}")
+}
+
+fn shrink_activation(position: usize) -> String {
+    format!("shrink_conv.{position}")
+}
+
+/// Adds the activations that quantising a folded backbone and its shrink layers needs, for a canvas
+/// `[1, C_pillar, H, W]`; nothing if they stay in floating point.
+///
+/// # Errors
+/// Those of the tensor library.
+pub fn observe_backbone(
+    backbone: &BevBackbone,
+    shrink: Option<&Shrink>,
+    canvas: &Tensor,
+    search: &mut ScaleSearch,
+) -> Result<(), TchError> {
+    let (Some((levels, up)), Some(shrink)) = (backbone.plain_layers(), shrink) else { return Ok(()) };
+    search.observe(CANVAS, canvas)?;
+    let mut observed = |layers: &[ConvLayer], x: &Tensor, name: &dyn Fn(usize) -> String| {
+        layers.iter().enumerate().try_fold(x.shallow_clone(), |x, (position, layer)| {
+            let y = layer.forward(&x, false);
+            search.observe(&name(position), &y)?;
+            Ok::<_, TchError>(y)
+        })
+    };
+    let mut x = canvas.shallow_clone();
+    let mut upsampled = Vec::new();
+    for (level, (layers, deblock)) in levels.into_iter().zip(up).enumerate() {
+        x = observed(layers, &x, &|position| block_activation(level, position))?;
+        upsampled.push(deblock.forward(&x, false));
+    }
+    let wide = Tensor::f_cat(&upsampled, 1)?;
+    let hidden = shrink.layers().split_last().map_or(&[][..], |(_, hidden)| hidden);
+    let _ = observed(hidden, &wide, &shrink_activation)?;
+    search.observe(UPSAMPLED, &wide)
+}

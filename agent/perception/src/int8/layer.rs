@@ -1,0 +1,68 @@
+//! Parameters of a quantised layer and its call.
+
+use tch::{IValue, Kind, TchError, Tensor};
+
+use super::operators::Operators;
+use super::scale::{Quantisation, Scale};
+use super::weight::QuantisedWeight;
+
+/// Number of `u8` in libtorch's list of types.
+const U8: i64 = 0;
+/// Number of `f32` in it.
+const F32: i64 = 6;
+
+/// Input and output of a quantised layer.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct LayerFormat {
+    /// Quantisation of the `u8` input.
+    pub input: Quantisation,
+    /// Scale of `u8` results, which are never negative; without one they are `f32`.
+    pub output: Option<Scale>,
+    /// A ReLU at the end.
+    pub relu: bool,
+}
+
+/// Weight, bias and format of a layer.
+#[derive(Debug)]
+pub(super) struct Layer {
+    packed: Tensor,
+    quantised: QuantisedWeight,
+    bias: Option<Tensor>,
+    format: LayerFormat,
+}
+
+impl Layer {
+    /// Quantises a weight `[C_out, ...]` with bias `[C_out]`; `pack` brings the quantised one into the order of the
+    /// operator.
+    pub(super) fn new(
+        weight: &Tensor,
+        bias: Option<&Tensor>,
+        format: LayerFormat,
+        pack: impl FnOnce(&Operators, &QuantisedWeight) -> Result<Tensor, TchError>,
+    ) -> Result<Self, TchError> {
+        let quantised = QuantisedWeight::new(weight)?;
+        let packed = pack(Operators::get()?, &quantised)?;
+        let bias = bias.map(|bias| bias.f_to_kind(Kind::Float)).transpose()?;
+        Ok(Self { packed, quantised, bias, format })
+    }
+
+    /// Calls an operator with this layer's parameters, followed by others of the operator.
+    pub(super) fn call(&self, operator: &str, x: &Tensor, others: Vec<IValue>) -> Result<Tensor, TchError> {
+        let LayerFormat { input, output, relu } = self.format;
+        let tensor = |tensor: &Tensor| IValue::Tensor(tensor.shallow_clone());
+        let mut arguments = vec![
+            tensor(x),
+            IValue::Double(input.scale.step()),
+            IValue::Int(i64::from(input.zero_point)),
+            tensor(&self.packed),
+            tensor(&self.quantised.scales),
+            tensor(&self.quantised.zero_points),
+            self.bias.as_ref().map_or(IValue::None, tensor),
+            IValue::Double(output.map_or(1.0, Scale::step)),
+            IValue::Int(if output.is_some() { U8 } else { F32 }),
+            IValue::String(if relu { "relu" } else { "none" }.to_owned()),
+        ];
+        arguments.extend(others);
+        Operators::get()?.call(operator, &arguments)
+    }
+}

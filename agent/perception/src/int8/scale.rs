@@ -1,0 +1,116 @@
+//! Scale of quantised values: a power of two.
+
+use serde::{Deserialize, Serialize};
+use tch::{Kind, TchError, Tensor};
+
+/// Largest quantised activation.
+pub(super) const MAX_ACTIVATION: f32 = 255.0;
+
+/// Value of one quantisation step: 2 to the power of the exponent.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(transparent)]
+pub struct Scale {
+    /// Exponent of two.
+    pub exponent: i8,
+}
+
+impl Scale {
+    /// The scale `2^exponent`.
+    #[must_use]
+    pub const fn of_exponent(exponent: i8) -> Self {
+        Self { exponent }
+    }
+
+    /// The smallest scale with which `levels` steps reach `magnitude`, that is positive and finite.
+    #[must_use]
+    pub(super) fn reaching(magnitude: f64, levels: f64) -> Self {
+        let exponent = (magnitude / levels).log2().ceil();
+        Self { exponent: exponent.clamp(f64::from(i8::MIN), f64::from(i8::MAX)) as i8 }
+    }
+
+    /// Value of one step.
+    #[must_use]
+    pub fn step(self) -> f64 {
+        f64::from(self.exponent).exp2()
+    }
+
+    /// The next smaller scale.
+    #[must_use]
+    pub(super) fn finer(self) -> Self {
+        Self { exponent: self.exponent.saturating_sub(1) }
+    }
+}
+
+/// Meaning of `u8` values: `step * (value - zero_point)`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Quantisation {
+    /// Step.
+    pub scale: Scale,
+    /// The `u8` value of zero; 0 for values that are never negative.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub zero_point: u8,
+}
+
+fn is_zero(value: &u8) -> bool {
+    *value == 0
+}
+
+impl Quantisation {
+    /// Quantisation of values that are never negative.
+    #[must_use]
+    pub const fn unsigned(scale: Scale) -> Self {
+        Self { scale, zero_point: 0 }
+    }
+
+    /// Nearest quantised values, `u8`, in the memory order of `x`; values out of range become the nearest in range.
+    ///
+    /// # Errors
+    /// Those of the tensor library.
+    pub fn quantise(&self, x: &Tensor) -> Result<Tensor, TchError> {
+        let mut steps = x.f_mul_scalar(self.scale.step().recip())?.f_round_()?;
+        if self.zero_point != 0 {
+            steps = steps.f_add_scalar_(i64::from(self.zero_point))?;
+        }
+        steps.f_clamp_(0, i64::from(u8::MAX))?.f_to_kind(Kind::Uint8)
+    }
+
+    /// The same of one value.
+    #[must_use]
+    pub fn quantise_value(&self, value: f32) -> u8 {
+        let steps = (value * self.scale.step().recip() as f32).round_ties_even() + f32::from(self.zero_point);
+        steps.clamp(0.0, MAX_ACTIVATION) as u8
+    }
+
+    /// Values of quantised ones, `f32`.
+    ///
+    /// # Errors
+    /// Those of the tensor library.
+    pub fn dequantise(&self, steps: &Tensor) -> Result<Tensor, TchError> {
+        let mut centred = steps.f_to_kind(Kind::Float)?.f_sub_scalar_(i64::from(self.zero_point))?;
+        centred.f_mul_scalar_(self.scale.step())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn values_are_rounded_to_the_nearest_step_and_clamped() {
+        let quantisation = Quantisation { scale: Scale::of_exponent(-2), zero_point: 10 };
+        let values = [-9.0_f32, -2.5, 0.0, 0.125, 0.126, 1.0, 61.25, 99.0];
+        let expected = [0_u8, 0, 10, 10, 11, 14, 255, 255];
+        let found = quantisation.quantise(&Tensor::from_slice(&values)).unwrap();
+        assert_eq!(Vec::<u8>::try_from(&found).unwrap(), expected);
+        assert_eq!(values.map(|value| quantisation.quantise_value(value)), expected);
+        let back = Vec::<f32>::try_from(quantisation.dequantise(&found).unwrap()).unwrap();
+        assert_eq!(back, [-2.5, -2.5, 0.0, 0.0, 0.25, 1.0, 61.25, 61.25]);
+    }
+
+    #[test]
+    fn the_smallest_scale_that_reaches_a_magnitude() {
+        for (magnitude, exponent) in [(63.0, 0), (63.1, 1), (31.5, -1), (0.5, -6)] {
+            assert_eq!(Scale::reaching(magnitude, 63.0), Scale::of_exponent(exponent), "{magnitude}");
+        }
+    }
+}

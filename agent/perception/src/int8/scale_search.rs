@@ -1,0 +1,108 @@
+//! Search for the scales of activations.
+
+use std::collections::BTreeMap;
+
+use tch::{Kind, TchError, Tensor};
+
+use super::activation_scales::ActivationScales;
+use super::scale::{MAX_ACTIVATION, Quantisation, Scale};
+
+/// Exponents that are tried.
+const EXPONENTS: std::ops::RangeInclusive<i8> = -14..=4;
+
+/// Squared error of every scale for each activation that was observed.
+#[derive(Debug, Default)]
+pub struct ScaleSearch {
+    activations: BTreeMap<String, Observed>,
+}
+
+/// Errors of the scales for one activation, summed over what was observed.
+#[derive(Debug, Default)]
+struct Observed {
+    /// Of values that are never negative, by exponent.
+    unsigned: BTreeMap<i8, f64>,
+    /// Of values around zero, with a zero point in the middle.
+    centred: BTreeMap<i8, f64>,
+    is_negative: bool,
+}
+
+/// Zero point of activations that may be negative.
+const MIDDLE: u8 = 128;
+
+impl ScaleSearch {
+    /// Adds values of an activation.
+    ///
+    /// # Errors
+    /// Those of the tensor library.
+    pub fn observe(&mut self, name: &str, values: &Tensor) -> Result<(), TchError> {
+        let observed = self.activations.entry(name.to_owned()).or_default();
+        observed.is_negative |= values.f_min()?.f_double_value(&[])? < 0.0;
+        let largest = values.f_abs()?.f_max()?.f_double_value(&[])?;
+        let power = values.f_square()?.f_sum(Kind::Double)?.f_double_value(&[])?;
+        let count = values.numel() as f64;
+        for exponent in EXPONENTS {
+            let scale = Scale::of_exponent(exponent);
+            let reach = scale.step() * f64::from(MAX_ACTIVATION) / largest;
+            // Measured where the best scale can be. Finer steps clamp nearly all; coarser ones err evenly.
+            let error = |zero_point| match reach {
+                ..0.03 => Ok(power),
+                0.03..4.0 => squared_error(values, Quantisation { scale, zero_point }),
+                _ => Ok(power.min(count * scale.step().powi(2) / 12.0)),
+            };
+            *observed.unsigned.entry(exponent).or_default() += error(0)?;
+            *observed.centred.entry(exponent).or_default() += error(MIDDLE)?;
+        }
+        Ok(())
+    }
+
+    /// Adds the activations of another search, which has other names.
+    pub fn merge(&mut self, other: Self) {
+        self.activations.extend(other.activations);
+    }
+
+    /// The scales with the smallest squared errors.
+    #[must_use]
+    pub fn scales(&self) -> ActivationScales {
+        let best = |errors: &BTreeMap<i8, f64>| {
+            let best = errors.iter().min_by(|(_, a), (_, b)| a.total_cmp(b));
+            Scale::of_exponent(best.map_or(0, |(&exponent, _)| exponent))
+        };
+        let chosen = self.activations.iter().map(|(name, observed)| {
+            let quantisation = match observed.is_negative {
+                true => Quantisation { scale: best(&observed.centred), zero_point: MIDDLE },
+                false => Quantisation::unsigned(best(&observed.unsigned)),
+            };
+            (name.clone(), quantisation)
+        });
+        ActivationScales::new(chosen.collect())
+    }
+}
+
+fn squared_error(values: &Tensor, quantisation: Quantisation) -> Result<f64, TchError> {
+    let back = quantisation.dequantise(&quantisation.quantise(values)?)?;
+    back.f_sub(values)?.f_square()?.f_sum(Kind::Double)?.f_double_value(&[])
+}
+
+#[cfg(test)]
+mod tests {
+    use tch::Device;
+
+    use super::*;
+
+    #[test]
+    fn scales_follow_the_values_and_rare_large_ones_are_clamped() {
+        tch::manual_seed(1);
+        let mut search = ScaleSearch::default();
+        let even = Tensor::rand([100_000], (Kind::Float, Device::Cpu));
+        let mut outlier = even.copy();
+        let _ = outlier.get(0).fill_(3.0);
+        for (name, values) in [("even", &even), ("outlier", &outlier), ("signed", &(&even - 0.5))] {
+            search.observe(name, values).unwrap();
+        }
+        let scales = search.scales();
+        let found = |name: &str| scales.get(name).unwrap();
+        assert_eq!(found("even"), Quantisation::unsigned(Scale::of_exponent(-8)));
+        assert_eq!(found("outlier"), Quantisation::unsigned(Scale::of_exponent(-7)));
+        assert_eq!(found("signed"), Quantisation { scale: Scale::of_exponent(-8), zero_point: MIDDLE });
+    }
+}

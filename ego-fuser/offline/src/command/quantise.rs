@@ -1,0 +1,49 @@
+//! `ego-fuser quantise`: scales of activations for 8-bit inference, stored in the weights file.
+
+use std::path::PathBuf;
+
+use anyhow::Result;
+use dataset::IntensityScale;
+use ego_fuser_offline::scale_search::search_scales;
+use perception::int8::SCALES_KEY;
+use perception::weights::annotate;
+use support::cli::BadInput;
+use support::output;
+
+use super::scenarios;
+
+/// Search the scales of activations on a few training sweeps and store them in the weights files, which are then
+/// computed in 8-bit integers.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Arguments {
+    /// Weights files; their parameters stay as they are.
+    #[arg(required = true, value_name = "FILE")]
+    weights: Vec<PathBuf>,
+    /// Datasets, splits or scenarios; the first vehicle of each scenario is the ego.
+    #[arg(long, required = true, num_args = 1.., value_name = "DIR")]
+    data: Vec<PathBuf>,
+    /// Number that stored intensities are divided by [default: auto; see `sim-replay inspect --help`].
+    #[arg(long, value_name = "auto|1|255|NUMBER", default_value_t, hide_default_value = true)]
+    intensity_scale: IntensityScale,
+    /// Number of frames of every scenario.
+    #[arg(long, default_value_t = 5)]
+    frames: usize,
+}
+
+impl Arguments {
+    /// Searches, stores and prints a line per file.
+    pub(crate) fn run(self) -> Result<()> {
+        tch::set_num_threads(1);
+        let scenarios = scenarios(&self.data, self.intensity_scale)?;
+        for path in &self.weights {
+            let scales = search_scales(path, &scenarios, self.frames).map_err(BadInput::of)?;
+            if scales.is_empty() {
+                output::line(format_args!("{}: no layer can be quantised, unchanged", path.display()))?;
+                continue;
+            }
+            let sha256 = annotate(path, SCALES_KEY, &serde_json::to_string(&scales)?).map_err(BadInput::of)?;
+            output::line(format_args!("{}: {} activations, SHA-256 {sha256}", path.display(), scales.len()))?;
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,56 @@
+//! Scales of activations of a cooperative model, searched on recorded sweeps.
+
+use std::ops::ControlFlow;
+use std::path::Path;
+
+use dataset::{LoadOptions, Scenario};
+use perception::detector::Detector;
+use perception::int8::{ActivationScales, InferencePrecision, ScaleSearch};
+use perception::weights::Weights;
+
+use crate::evaluation::{EvaluateConfig, EvaluateError, Evaluator};
+
+/// Scales of the activations of a weights file, computed in floating point on the first `frames` ticks of every
+/// scenario with true poses: of the detector on the sweeps of all vehicles, of the fusion on their maps.
+///
+/// # Errors
+/// [`EvaluateError`] names the file and what is wrong with it.
+pub fn search_scales(weights: &Path, scenarios: &[Scenario], frames: usize) -> Result<ActivationScales, EvaluateError> {
+    let mut search = ScaleSearch::default();
+    observe_detector(weights, scenarios, frames, &mut search)?;
+    let mut evaluator = Evaluator::new(EvaluateConfig {
+        precision: InferencePrecision::Float,
+        weights: weights.to_owned(),
+        ..EvaluateConfig::default()
+    })?;
+    evaluator.ego_mut().fusion_mut().start_scale_search();
+    for scenario in scenarios {
+        let _ = evaluator.run(scenario, &mut |frame| match frame.tick + 1 < frames {
+            true => ControlFlow::Continue(()),
+            false => ControlFlow::Break(()),
+        })?;
+    }
+    if let Some(fusion) = evaluator.ego_mut().fusion_mut().take_scale_search() {
+        search.merge(fusion);
+    }
+    Ok(search.scales())
+}
+
+fn observe_detector(
+    weights: &Path,
+    scenarios: &[Scenario],
+    frames: usize,
+    search: &mut ScaleSearch,
+) -> Result<(), EvaluateError> {
+    let weights = Weights::load(weights)?.with_precision(InferencePrecision::Float);
+    let mut detector = Detector::from_weights(&weights, &weights.config()?)?;
+    for scenario in scenarios {
+        for tick in 0..scenario.ticks.len().min(frames) {
+            let loaded = scenario.load_tick(tick, 0..scenario.agents.len(), &LoadOptions::default());
+            for (_, frame) in loaded.frames {
+                detector.observe(&frame.points, search)?;
+            }
+        }
+    }
+    Ok(())
+}
