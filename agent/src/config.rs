@@ -14,6 +14,7 @@ use crate::attack::Falsification;
 use crate::node::NodeOptions;
 use crate::rate::RateConfig;
 use localization::pose_source::PoseSourceConfig;
+use perception::inference::Inference;
 use perception::int8::InferencePrecision;
 use perception::weights::{Weights, WeightsError};
 
@@ -76,6 +77,12 @@ impl ModelConfig {
     /// [`WeightsError`] names the file.
     pub fn load(&self) -> Result<Weights, WeightsError> {
         Ok(Weights::load(&self.weights)?.with_precision(self.precision))
+    }
+
+    /// How networks are computed.
+    #[must_use]
+    pub fn inference(&self) -> Inference {
+        Inference { precision: self.precision, ..Inference::default() }
     }
 }
 

@@ -9,7 +9,7 @@
 use std::collections::BTreeMap;
 use std::error::Error;
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::time::Instant;
 
 use agent::agent::{Agent, AgentInput};
@@ -21,6 +21,9 @@ use ego_fuser::ego::{Content, Ego, View};
 use fusion::{Exchange, Method};
 use localization::pose_source::PoseSourceConfig;
 use perception::detector::Detector;
+use perception::inference::Inference;
+use perception::int8::InferencePrecision;
+use perception::weights::Weights;
 use protocol::{CodecConfig, EncodedFeatures, Limits, Pose, PoseEstimate};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -46,6 +49,9 @@ struct Arguments {
     /// Folder of the released weights.
     #[arg(long, default_value = "deploy/weights")]
     weights: PathBuf,
+    /// Number format in which networks are computed.
+    #[arg(long, value_enum, default_value_t)]
+    precision: InferencePrecision,
     /// Numbers of vehicles, the ego included.
     #[arg(long, num_args = 1.., default_values_t = [2, 3, 4])]
     vehicles: Vec<usize>,
@@ -80,10 +86,11 @@ fn main() -> Result<(), Failure> {
         let named = arguments.weights.join(format!("lean-{method}.safetensors"));
         let weights = if named.exists() { named } else { arguments.weights.join("lean-none.safetensors") };
         for &vehicles in &arguments.vehicles {
+            let weights = Weights::load(&weights)?.with_precision(arguments.precision);
             let frames = sent(&scenario, &weights, method, [vehicles, arguments.frames])?;
             let mut best: Vec<BTreeMap<String, f64>> = vec![BTreeMap::new(); frames.len()];
             for run in 0..arguments.runs {
-                let mut ego = Ego::load(&weights, Some(method))?;
+                let mut ego = Ego::from_weights(&weights, Some(method))?;
                 for (index, (frame, best)) in frames.iter().zip(&mut best).enumerate() {
                     let found = timed(&mut ego, frame, best)?;
                     if run + 1 == arguments.runs {
@@ -139,15 +146,15 @@ impl Sent {
 /// Messages of all vehicles, frame by frame.
 fn sent(
     scenario: &Scenario,
-    weights: &Path,
+    weights: &Weights,
     method: Method,
     [vehicles, frames]: [usize; 2],
 ) -> Result<Vec<Vec<Sent>>, Failure> {
     let mut random = ChaCha8Rng::seed_from_u64(vehicles as u64);
     let mut agents = Vec::new();
     for cav in scenario.agents.iter().take(vehicles) {
-        let source = PoseSourceConfig::Recorded.for_scenario(&scenario.name).build()?;
-        agents.push(Agent::new(cav.clone(), source, Detector::load(weights)?));
+        let source = PoseSourceConfig::Recorded.for_scenario(&scenario.name).build(Inference::default())?;
+        agents.push(Agent::new(cav.clone(), source, Detector::from_weights(weights, &weights.config()?)?));
     }
     let mut all = Vec::with_capacity(frames);
     for tick in 0..frames {

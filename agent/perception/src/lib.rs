@@ -14,6 +14,7 @@
 pub mod boxes;
 pub mod crop;
 pub mod detector;
+pub mod inference;
 pub mod int8;
 pub mod layers;
 pub mod model_config;

@@ -16,6 +16,7 @@ use link::LinkEmulator;
 use localization::competitors::EndToEndLocalizer;
 use localization::pgc::{Localizer, LocalizerError};
 use localization::pose_source::{PgcConfig, PoseSourceConfig, TrackedPoseConfig};
+use perception::inference::Inference;
 use perception::model_config::DetectorConfig;
 use perception::weights::Weights;
 use protocol::{CavId, Principal, Role};
@@ -209,7 +210,7 @@ fn load_networks(pose: &PoseSourceConfig) -> Result<(), LocalizerError> {
     match pose {
         PoseSourceConfig::Pgc(PgcConfig { encoder, head, .. })
         | PoseSourceConfig::Tracked(TrackedPoseConfig { encoder, head, .. }) => {
-            Localizer::load(encoder, head, Device::Cpu).map(drop)
+            Localizer::load(encoder, head, Inference::default()).map(drop)
         }
         PoseSourceConfig::EndToEnd(network) => EndToEndLocalizer::load(&network.weights, Device::Cpu).map(drop),
         PoseSourceConfig::Recorded | PoseSourceConfig::Noisy(_) | PoseSourceConfig::Cached(_) => Ok(()),

@@ -25,6 +25,7 @@ use dataset::ground_truth::{self, GroundTruthRule};
 use dataset::{LeftOut, LoadOptions, Scenario};
 use localization::pose_source::{NoiseMode, PoseSourceConfig};
 use perception::detector::Detector;
+use perception::inference::Inference;
 use perception::int8::InferencePrecision;
 use perception::model_config::DetectorConfig;
 use perception::weights::Weights;
@@ -257,7 +258,8 @@ impl Evaluator {
             Some(falsification) => Some(Attack::new(falsification, cav, 0)),
             None => self.config.attack.and_then(|attack| attack.of(place, cav)),
         };
-        let agent = Agent::new(cav.clone(), source.for_scenario(&scenario.name).build()?, detector);
+        let inference = Inference { precision: self.config.precision, ..Inference::default() };
+        let agent = Agent::new(cav.clone(), source.for_scenario(&scenario.name).build(inference)?, detector);
         Ok(Participant::new(agent.within(rate), attack))
     }
 

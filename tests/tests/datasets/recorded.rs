@@ -9,8 +9,8 @@ use dataset::ground_truth::{self, GroundTruthRule};
 use dataset::pcd;
 use dataset::{self, Dataset, Layout, LoadOptions, OpenOptions};
 use localization::pgc::Localizer;
+use perception::inference::Inference;
 use sim_replay::inspect::{TickReport, inspect};
-use tch::Device;
 use tests::fixtures::data;
 
 fn open(name: &str) -> Dataset {
@@ -247,7 +247,7 @@ fn a_real_sweep_passes_through_the_shipped_networks_and_is_placed_nowhere() {
     tch::set_num_threads(1);
     let weights = Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy/weights");
     let [encoder, head] = ["pgc-encoder", "pgc-town1"].map(|name| weights.join(format!("{name}.safetensors")));
-    let localizer = Localizer::load(&encoder, &head, Device::Cpu).unwrap();
+    let localizer = Localizer::load(&encoder, &head, Inference::default()).unwrap();
     let frame = dataset.scenarios[0].load(0, 0, &LoadOptions::default()).unwrap();
     let (coordinates, _) = localizer.scene_coordinates(&frame.points).unwrap();
     assert!(coordinates.sensor_m.len() > 100, "{} cells", coordinates.sensor_m.len());

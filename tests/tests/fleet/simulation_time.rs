@@ -5,7 +5,6 @@ use std::ops::ControlFlow;
 use std::path::Path;
 use std::process::{Command, Output};
 
-use agent::rate::RateConfig;
 use deploy::run::run_fleet::{RunOptions, RunResult, run_scenario};
 use deploy::scenario::Scenario;
 use ego_fuser::pairing::PairingConfig;
@@ -13,7 +12,6 @@ use ego_fuser_offline::evaluation::stepped::{AgentPool, ComputeTimes, SteppedCon
 use ego_fuser_offline::evaluation::{EvaluateConfig, EvaluatedFrame, Evaluator};
 use fusion::Method;
 use link::{ClockStep, DelayModel, DeviceClock, LinkConfig, LossModel};
-use localization::pose_source::PoseSourceConfig;
 use protocol::{CodecConfig, DropReason, Dtype};
 use serde_json::Value;
 use tests::fleet::{programs, results, write_scenario, write_sighted_weights};

@@ -5,10 +5,8 @@ use std::path::{Path, PathBuf};
 use std::sync::MutexGuard;
 
 use ::training::train::{self, Accuracy, Observer, StepReport, Summary, TrainConfig, TrainError};
-use agent::rate::RateConfig;
 use ego_fuser_offline::evaluation::{EvaluateConfig, EvaluatedFrame, Evaluator};
 use fusion::Method;
-use localization::pose_source::PoseSourceConfig;
 use perception::train::{Length, RunConfig};
 use protocol::{CodecConfig, Dtype};
 use tempfile::TempDir;

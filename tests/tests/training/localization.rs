@@ -10,6 +10,7 @@ use agent_offline::training::{
 use dataset::{self, LoadOptions};
 use localization::competitors::{EndToEndKind, EndToEndLocalizer};
 use localization::pgc::{Localizer, LocalizerError, SceneEncoder};
+use perception::inference::Inference;
 use perception::train::{Length, RunConfig, TrainingError};
 use perception::weights::Weights;
 use protocol::{NoPoseReason, PointCloud, PoseEstimate};
@@ -99,7 +100,7 @@ fn a_localizer_learns_two_drives_and_finds_itself_on_them() {
     assert!(errors.last().unwrap() < &(0.3 * errors[0]), "{errors:?}");
     assert!(summary.accuracy.unwrap().success_3m > 0.5, "{:?}", summary.accuracy);
 
-    let localizer = Localizer::load(&encoder, &summary.trained.weights, Device::Cpu).unwrap();
+    let localizer = Localizer::load(&encoder, &summary.trained.weights, Inference::default()).unwrap();
     let dataset = dataset::open(&scenes).unwrap();
     let mut found = 0;
     for tick in 0..12 {
@@ -126,10 +127,11 @@ fn a_localizer_learns_two_drives_and_finds_itself_on_them() {
     let mut config = encoder_config(&scenes, &other, 1);
     config.run.seed = 6;
     train_encoder(&config, &mut |_| ()).unwrap();
-    let error = Localizer::load(&other.join("weights.safetensors"), &summary.trained.weights, Device::Cpu).unwrap_err();
+    let error = Localizer::load(&other.join("weights.safetensors"), &summary.trained.weights, Inference::default())
+        .unwrap_err();
     assert!(matches!(error, LocalizerError::OtherEncoder { .. }), "{error}");
     // And an encoder is no head.
-    let message = Localizer::load(&encoder, &encoder, Device::Cpu).unwrap_err().to_string();
+    let message = Localizer::load(&encoder, &encoder, Inference::default()).unwrap_err().to_string();
     assert!(message.contains("weights.safetensors") && message.contains("\"scene encoder\""), "{message}");
 }
 

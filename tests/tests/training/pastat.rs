@@ -8,13 +8,13 @@ use std::path::{Path, PathBuf};
 use ::training::feature_store::{FeatureStore, KeptMaps, MapSource, is_encoder};
 use ::training::samples::{Moments, SamplePoses};
 use ::training::train::{self, TrainConfig};
-use agent::rate::RateConfig;
 use dataset::{self, IntensityScale, LoadOptions, Scenario};
 use deploy::experiment::table::{self, TableObserver, TableSpec};
 use ego_fuser_offline::evaluation::{EvaluateConfig, EvaluatedFrame, Evaluator};
 use fusion::Method;
 use fusion::pastat::{Part, ablated};
 use localization::pose_source::{CachedPoseConfig, NoiseMode, NoisyPoseConfig, PoseRow, PoseSourceConfig, PoseTable};
+use perception::inference::Inference;
 use perception::weights::Weights;
 use protocol::{CodecConfig, Dtype, NoPoseReason, PoseEstimate};
 use tests::locks::random_generator_lock;
@@ -224,7 +224,7 @@ fn poses_that_were_found_once_serve_training_and_evaluation() {
 
     fs::write(&file, "scenario,cav\n").unwrap();
     let source = PoseSourceConfig::Cached(CachedPoseConfig { file, scenario: None });
-    assert!(source.build().unwrap_err().to_string().contains("poses.csv:1"));
+    assert!(source.build(Inference::default()).unwrap_err().to_string().contains("poses.csv:1"));
 }
 
 #[derive(Default)]

@@ -153,6 +153,8 @@ mod tests {
     use std::collections::BTreeMap;
     use std::path::PathBuf;
 
+    use perception::inference::Inference;
+
     use super::*;
     use crate::pgc::{Localizer, SceneEncoderConfig};
     use perception::weights::{CONFIG_KEY, KIND_KEY, Precision, save};
@@ -253,7 +255,7 @@ mod tests {
         let path = write(folder.path(), &EndToEndConfig { encoder: wide, ..pose.clone() }, &pose, &[0.0; 5]);
         assert!(error_text(&path).contains("voxel_m is -1"), "{}", error_text(&path));
         let path = write(folder.path(), &pose, &pose, &[0.0; 5]);
-        let message = Localizer::load(&path, &path, Device::Cpu).unwrap_err().to_string();
+        let message = Localizer::load(&path, &path, Inference::default()).unwrap_err().to_string();
         assert!(message.contains("\"end to end\"") && message.contains("\"scene encoder\""), "{message}");
         let bytes = std::fs::read(&path).unwrap();
         std::fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();

@@ -1,5 +1,6 @@
 //! Dense layer: a linear map of features.
 
+use perception::int8::{Int8Linear, LayerFormat};
 use tch::nn::{self, Init};
 use tch::{TchError, Tensor};
 
@@ -23,5 +24,10 @@ impl Dense {
     /// `[N, inputs]` to `[N, outputs]`.
     pub(crate) fn forward(&self, x: &Tensor) -> Result<Tensor, TchError> {
         self.bias.to_kind(x.kind()).f_addmm(x, &self.weight.to_kind(x.kind()))
+    }
+
+    /// The same in integers.
+    pub(crate) fn int8(&self, format: LayerFormat) -> Result<Int8Linear, TchError> {
+        Int8Linear::new(&self.weight.f_tr()?.f_contiguous()?, Some(&self.bias), format)
     }
 }

@@ -21,6 +21,8 @@ use super::scene_regression::SceneHead;
 use super::voxel_batch::VoxelBatch;
 use super::voxelise::{Cell, SweepVoxels};
 use crate::registration::Correspondence;
+use perception::inference::Inference;
+use perception::int8::ScaleSearch;
 use perception::weights::Weights;
 
 /// Largest number of regressed cells, where the head allows for more: more cells hardly improve poses, and they take
@@ -122,8 +124,8 @@ impl Localizer {
     /// # Errors
     /// [`LocalizerError`] when a file is missing, truncated or of another kind, when its confidence model is not valid,
     /// or when the head was trained on the features of another encoder.
-    pub fn load(encoder: &Path, head: &Path, device: Device) -> Result<Self, LocalizerError> {
-        let (mut localizer, weights) = Self::open(encoder, head, device)?;
+    pub fn load(encoder: &Path, head: &Path, inference: Inference) -> Result<Self, LocalizerError> {
+        let (mut localizer, weights) = Self::open(encoder, head, inference)?;
         localizer.solver.confidence = stored_confidence(&weights)?;
         Ok(localizer)
     }
@@ -133,13 +135,14 @@ impl Localizer {
     ///
     /// # Errors
     /// As [`Self::load`].
-    pub fn load_without_confidence(encoder: &Path, head: &Path, device: Device) -> Result<Self, LocalizerError> {
-        Ok(Self::open(encoder, head, device)?.0)
+    pub fn load_without_confidence(encoder: &Path, head: &Path, inference: Inference) -> Result<Self, LocalizerError> {
+        Ok(Self::open(encoder, head, inference)?.0)
     }
 
-    fn open(encoder: &Path, head: &Path, device: Device) -> Result<(Self, Weights), LocalizerError> {
-        let (network, encoder_sha256) = SceneEncoder::load(encoder, device)?;
-        let weights = Weights::load(head)?;
+    fn open(encoder: &Path, head: &Path, inference: Inference) -> Result<(Self, Weights), LocalizerError> {
+        let Inference { device, precision } = inference;
+        let (mut network, encoder_sha256) = SceneEncoder::load(encoder, device)?;
+        let weights = Weights::load(head)?.with_precision(precision);
         weights.check_kind(SceneHead::KIND)?;
         let config: SceneHeadConfig = weights.config()?;
         if config.encoder_sha256 != encoder_sha256 {
@@ -151,11 +154,33 @@ impl Localizer {
             });
         }
         let mut variables = VarStore::new(device);
-        let scene_head = SceneHead::new(&variables.root(), &config)?;
+        let mut scene_head = SceneHead::new(&variables.root(), &config)?;
         weights.copy_into(&variables)?;
         variables.freeze();
+        if let Some(scales) = weights.activation_scales()? {
+            let quantised = network.quantise(&scales).and_then(|()| scene_head.quantise(&scales));
+            quantised.map_err(|error| weights.quantise_error(error))?;
+        }
         let sha256 = [encoder_sha256, weights.sha256().to_owned()];
         Ok((Self { encoder: network, head: scene_head, solver: PoseSolver::default(), device, sha256 }, weights))
+    }
+
+    /// Adds the activations of a sweep to a search for their scales; a sweep without cells has none.
+    ///
+    /// # Errors
+    /// [`LocalizerError::Tensor`] when the tensor library fails.
+    pub fn observe(&self, cloud: &PointCloud, search: &mut ScaleSearch) -> Result<(), LocalizerError> {
+        let mut times = LocalizerTimes::default();
+        let Some(EncodedSweep { sweep, features, .. }) = self.encode(cloud, &mut times)? else { return Ok(()) };
+        let batch = VoxelBatch::new(&[&sweep], self.encoder.config(), self.device)?;
+        self.encoder.observe(&batch, search)?;
+        let chosen = choose_evenly(sweep.cells(), self.head.config().max_cells.min(CELLS));
+        let cells = self.pick(&sweep, &features, &chosen)?.features;
+        no_grad(|| {
+            let logits = self.head.classify(&features.sweeps, false)?.f_expand([chosen.len() as i64, -1], false)?;
+            self.head.observe(&self.head.normalise(&cells)?, &logits, search)
+        })?;
+        Ok(())
     }
 
     /// SHA-256 of encoder and head.

@@ -2,13 +2,16 @@
 
 use std::path::Path;
 
-use tch::nn::{self, Init, VarStore};
+use tch::nn::{self, VarStore};
 use tch::{Device, Kind, TchError, Tensor, no_grad};
 
 use super::encoder_config::SceneEncoderConfig;
 use super::error::LocalizerError;
+use super::int8_levels::Int8Levels;
+use super::residual_group::{OnActivation, ResidualGroup};
 use super::voxel_batch::VoxelBatch;
-use perception::sparse::{GatherIndex, SparseConv};
+use perception::int8::{ActivationScales, LayerFormat, QuantiseError, ScaleSearch};
+use perception::sparse::SparseConv;
 use perception::weights::Weights;
 
 /// Output of the encoder for some sweeps.
@@ -37,6 +40,7 @@ pub struct SceneEncoder {
     down: Vec<SparseConv>,
     fine: Option<ResidualGroup>,
     coarse: Vec<ResidualGroup>,
+    int8: Option<Int8Levels>,
 }
 
 impl SceneEncoder {
@@ -61,7 +65,7 @@ impl SceneEncoder {
             coarse.push(ResidualGroup::new(&(path / "residual" / group), channels, width));
             channels = width;
         }
-        Ok(Self { config: config.clone(), first, down, fine, coarse })
+        Ok(Self { config: config.clone(), first, down, fine, coarse, int8: None })
     }
 
     /// Reads an encoder from a weights file that contains its configuration, frozen. Returns the file's SHA-256 beside
@@ -91,25 +95,64 @@ impl SceneEncoder {
     /// # Errors
     /// Those of the tensor library.
     pub fn local(&self, batch: &VoxelBatch, kind: Kind) -> Result<LocalFeatures, TchError> {
+        self.local_with(batch, kind, &mut |_, _| Ok(()))
+    }
+
+    /// Adds the activations that [`Self::quantise`] needs scales of.
+    ///
+    /// # Errors
+    /// Those of the tensor library.
+    pub fn observe(&self, batch: &VoxelBatch, search: &mut ScaleSearch) -> Result<(), TchError> {
+        no_grad(|| self.local_with(batch, Kind::Float, &mut |name, values| search.observe(name, values)).map(drop))
+    }
+
+    fn local_with(
+        &self,
+        batch: &VoxelBatch,
+        kind: Kind,
+        on_activation: &mut OnActivation<'_>,
+    ) -> Result<LocalFeatures, TchError> {
         let mut x = self.first.forward(&batch.input.to_kind(kind), &batch.first)?.f_relu()?;
+        on_activation(&level_activation(0), &x)?;
         let mut fine = None;
         for (level, conv) in self.down.iter().enumerate() {
             if level + 1 == self.down.len()
                 && let (Some(group), Some(index)) = (&self.fine, &batch.fine)
             {
-                fine = Some(group.forward(&x, index)?);
+                fine = Some(group.forward(&x, index, FINE, on_activation)?);
             }
             x = conv.forward(&x, &batch.down[level])?.f_relu()?;
+            on_activation(&level_activation(level + 1), &x)?;
         }
-        for group in &self.coarse {
-            x = group.forward(&x, &batch.coarse)?;
+        for (number, group) in self.coarse.iter().enumerate() {
+            x = group.forward(&x, &batch.coarse, &coarse_activation(number), on_activation)?;
+            on_activation(&coarse_activation(number), &x)?;
         }
-        let spread = rows(&x, &batch.coarse_of_cell)?;
-        let cells = match fine {
-            Some(fine) => Tensor::f_cat(&[fine, spread], 1)?,
-            None => spread,
-        };
-        Ok(LocalFeatures { cells, coarse: x })
+        LocalFeatures::new(fine, x, batch)
+    }
+
+    /// Computes in integers from here on, in [`Self::encode`].
+    ///
+    /// # Errors
+    /// [`QuantiseError`] names the activation whose scale is missing.
+    pub fn quantise(&mut self, scales: &ActivationScales) -> Result<(), QuantiseError> {
+        let first = scales.get(&level_activation(0))?;
+        let (mut input, mut before) = (first, first);
+        let mut down = Vec::with_capacity(self.down.len());
+        for (level, conv) in self.down.iter().enumerate() {
+            let output = scales.get(&level_activation(level + 1))?;
+            down.push(conv.int8(LayerFormat { input, output: Some(output.scale), relu: true })?);
+            (before, input) = (input, output);
+        }
+        let fine = self.fine.as_ref().map(|group| group.int8(before, FINE, scales)).transpose()?;
+        let last = input;
+        let mut coarse = Vec::with_capacity(self.coarse.len());
+        for (number, group) in self.coarse.iter().enumerate() {
+            coarse.push((group.int8(input, &coarse_activation(number), scales)?, input));
+            input = scales.get(&coarse_activation(number))?;
+        }
+        self.int8 = Some(Int8Levels { first, down, fine, coarse, last });
+        Ok(())
     }
 
     /// Features of cells with their surroundings, and of the sweeps.
@@ -138,55 +181,50 @@ impl SceneEncoder {
         Ok(SceneFeatures { cells: Tensor::f_cat(&parts, 1)?, sweeps: Tensor::f_stack(&sweeps, 0)? })
     }
 
-    /// Both steps without gradients.
+    /// Both steps without gradients; in integers once [quantised](Self::quantise), otherwise in `kind`.
     ///
     /// # Errors
     /// Those of the tensor library.
     pub fn encode(&self, batch: &VoxelBatch, kind: Kind) -> Result<SceneFeatures, TchError> {
-        no_grad(|| self.complete(&self.local(batch, kind)?, batch))
+        no_grad(|| {
+            let local = match &self.int8 {
+                Some(levels) => {
+                    let first = self.first.forward(&batch.input, &batch.first)?.f_relu_()?;
+                    let (fine, coarse) = levels.forward(&first, batch)?;
+                    LocalFeatures::new(fine, coarse, batch)?
+                }
+                None => self.local(batch, kind)?,
+            };
+            self.complete(&local, batch)
+        })
     }
+}
+
+impl LocalFeatures {
+    fn new(fine: Option<Tensor>, coarse: Tensor, batch: &VoxelBatch) -> Result<Self, TchError> {
+        let spread = rows(&coarse, &batch.coarse_of_cell)?;
+        let cells = match fine {
+            Some(fine) => Tensor::f_cat(&[fine, spread], 1)?,
+            None => spread,
+        };
+        Ok(Self { cells, coarse })
+    }
+}
+
+/// Name of the fine group among the activations.
+const FINE: &str = "encoder.fine";
+
+fn level_activation(level: usize) -> String {
+    format!("encoder.levels.{level}")
+}
+
+fn coarse_activation(group: usize) -> String {
+    format!("encoder.residual.{group}")
 }
 
 /// Rows of `x` by index; its gradient is fast because the index is expanded, not written out.
 fn rows(x: &Tensor, index: &Tensor) -> Result<Tensor, TchError> {
     x.f_gather(0, &index.f_unsqueeze(1)?.f_expand([-1, x.size()[1]], false)?, false)
-}
-
-/// Two 3x3x3 convolutions with a 1x1 one between them, and a skip connection.
-#[derive(Debug)]
-struct ResidualGroup {
-    inward: SparseConv,
-    middle: Tensor,
-    middle_bias: Tensor,
-    outward: SparseConv,
-    skip: Option<Tensor>,
-}
-
-impl ResidualGroup {
-    fn new(path: &nn::Path<'_>, inputs: i64, outputs: i64) -> Self {
-        let pointwise = |name: &str, from: i64| {
-            let stdev = (2.0 / from as f64).sqrt();
-            (path / name).var("weight", &[from, outputs], Init::Randn { mean: 0.0, stdev })
-        };
-        Self {
-            inward: SparseConv::new(&(path / "inward"), inputs, outputs),
-            middle: pointwise("middle", outputs),
-            middle_bias: (path / "middle").var("bias", &[outputs], Init::Const(0.0)),
-            outward: SparseConv::new(&(path / "outward"), outputs, outputs),
-            skip: (inputs != outputs).then(|| pointwise("skip", inputs)),
-        }
-    }
-
-    fn forward(&self, x: &Tensor, index: &GatherIndex) -> Result<Tensor, TchError> {
-        let kind = x.kind();
-        let inner = self.inward.forward(x, index)?.f_relu()?;
-        let inner = self.middle_bias.to_kind(kind).f_addmm(&inner, &self.middle.to_kind(kind))?.f_relu()?;
-        let inner = self.outward.forward(&inner, index)?;
-        match &self.skip {
-            Some(skip) => (inner + x.f_matmul(&skip.to_kind(kind))?).f_relu(),
-            None => (inner + x).f_relu(),
-        }
-    }
 }
 
 /// Coarse features summed over height into the plane of each sweep.
@@ -213,8 +251,11 @@ impl Plane {
 
     /// `[sweeps * edge * edge, channels]`: mean over the coarse cells in a square window.
     fn mean_over(&self, window: i64) -> Result<Tensor, TchError> {
-        let pooled =
-            |values: &Tensor| values.f_avg_pool2d([window; 2], [1; 2], [window / 2; 2], false, true, None::<i64>);
+        // A square window is one row after one column of it: a fifth of the additions.
+        let along = |values: &Tensor, size: [i64; 2]| {
+            values.f_avg_pool2d(size, [1; 2], size.map(|n| n / 2), false, true, None::<i64>)
+        };
+        let pooled = |values: &Tensor| along(&along(values, [window, 1])?, [1, window]);
         let mean = pooled(&self.sum)? / pooled(&self.count)?.f_clamp_min(1e-6)?;
         let channels = mean.size()[1];
         mean.f_permute([0, 2, 3, 1])?.f_reshape([-1, channels])
@@ -266,6 +307,24 @@ mod tests {
         let encode = |sweep| encoder.encode(&VoxelBatch::new(&[sweep], &config, Device::Cpu).unwrap(), Kind::Float);
         let (here, there) = (encode(&here).unwrap(), encode(&there).unwrap());
         assert!(here.cells.allclose(&there.cells, 1e-3, 1e-3, false));
+    }
+
+    #[test]
+    fn integers_change_the_features_little() {
+        for config in [SceneEncoderConfig::lean(), SceneEncoderConfig::full(0.125)] {
+            let (_network, mut encoder) = encoder(&config);
+            let sweep = SweepVoxels::new(sweep(0.0), &config);
+            let batch = VoxelBatch::new(&[&sweep], &config, Device::Cpu).unwrap();
+            let expected = encoder.encode(&batch, Kind::Float).unwrap();
+            let mut search = ScaleSearch::default();
+            encoder.observe(&batch, &mut search).unwrap();
+            no_grad(|| encoder.quantise(&search.scales())).unwrap();
+            let found = encoder.encode(&batch, Kind::Float).unwrap();
+            for (found, expected) in [(found.cells, expected.cells), (found.sweeps, expected.sweeps)] {
+                let error = (&found - &expected).square().mean(Kind::Float).sqrt().double_value(&[]);
+                assert!(error > 0.0 && error < 0.05 * expected.std(true).double_value(&[]), "{error}");
+            }
+        }
     }
 
     #[test]

@@ -7,7 +7,10 @@ use super::dense::Dense;
 use super::error::LocalizerError;
 use super::feature_norm::FeatureNorm;
 use super::head_config::SceneHeadConfig;
+use super::int8_block::Int8Block;
 use super::refinement_network::Refiner;
+use super::residual_group::OnActivation;
+use perception::int8::{ActivationScales, LayerFormat, Quantisation, QuantiseError, ScaleSearch};
 use perception::layers::convolution::Norm;
 
 /// Hidden layers of the classifier of sweeps, as in LightLoc.
@@ -40,6 +43,14 @@ pub struct SceneHead {
     blocks: Vec<[Dense; 3]>,
     outward: Dense,
     refiner: Option<Refiner>,
+    int8: Option<Vec<Int8Block>>,
+}
+
+/// Name of the output of the first layer among the activations.
+const INWARD: &str = "head.inward";
+
+fn block_activation(block: usize, part: &str) -> String {
+    format!("head.blocks.{block}.{part}")
 }
 
 impl SceneHead {
@@ -67,6 +78,7 @@ impl SceneHead {
             blocks: (0..blocks).map(block).collect(),
             outward: Dense::new(&(path / "outward"), width, centres + 4, 0.1),
             refiner: config.refiner.as_ref().map(|config| Refiner::new(&(path / "refiner"), config)).transpose()?,
+            int8: None,
         })
     }
 
@@ -117,20 +129,72 @@ impl SceneHead {
         logits: &Tensor,
         kind: Kind,
     ) -> Result<(Regression, Tensor), TchError> {
-        let norm = logits.f_square()?.f_sum_dim_intlist(1_i64, true, Kind::Float)?.f_add_scalar(1e-12)?.f_sqrt()?;
-        let input = Tensor::f_cat(&[cells, &(logits / norm)], 1)?.f_to_kind(kind)?;
-        let mut x = self.inward.forward(&input)?.f_relu()?;
-        for [first, second, third] in &self.blocks {
-            let inner = second.forward(&first.forward(&x)?.f_relu()?)?.f_relu()?;
-            x = (x + third.forward(&inner)?).f_relu()?;
-        }
-        let output = self.outward.forward(&x)?.f_to_kind(Kind::Float)?;
+        let input = self.input(cells, logits)?;
+        let inward = self.inward.forward(&input.f_to_kind(kind)?)?.f_relu()?;
+        let hidden = match &self.int8 {
+            Some(blocks) => blocks.iter().try_fold(inward, |x, block| block.forward(&x))?,
+            None => self.hidden(inward, &mut |_, _| Ok(()))?,
+        };
+        let output = self.outward.forward(&hidden)?.f_to_kind(Kind::Float)?;
         let centres = self.config.centres;
         let log_shares = output.f_narrow(1, 0, centres)?.f_log_softmax(1, Kind::Float)?;
         let offset = output.f_narrow(1, centres, 3)? * OFFSET_SCALE_M;
         let coordinates_m = log_shares.f_exp()?.f_matmul(&self.centres)? + offset;
         let epsilon_m = output.f_narrow(1, centres + 3, 1)?.f_squeeze_dim(1)?.f_softplus()?;
         Ok((Regression { coordinates_m, epsilon_m }, log_shares))
+    }
+
+    /// Residual blocks in floating point, from the output of the first layer on.
+    fn hidden(&self, inward: Tensor, on_activation: &mut OnActivation<'_>) -> Result<Tensor, TchError> {
+        on_activation(INWARD, &inward)?;
+        let mut x = inward;
+        for (number, [first, second, third]) in self.blocks.iter().enumerate() {
+            let inner = first.forward(&x)?.f_relu()?;
+            on_activation(&block_activation(number, "0"), &inner)?;
+            let inner = second.forward(&inner)?.f_relu()?;
+            on_activation(&block_activation(number, "1"), &inner)?;
+            x = (x + third.forward(&inner)?).f_relu()?;
+            on_activation(&block_activation(number, "output"), &x)?;
+        }
+        Ok(x)
+    }
+
+    /// Adds the activations that [`Self::quantise`] needs scales of, for the input of [`Self::regress`].
+    ///
+    /// # Errors
+    /// Those of the tensor library.
+    pub fn observe(&self, cells: &Tensor, logits: &Tensor, search: &mut ScaleSearch) -> Result<(), TchError> {
+        let inward = self.inward.forward(&self.input(cells, logits)?)?.f_relu()?;
+        self.hidden(inward, &mut |name, values| search.observe(name, values)).map(drop)
+    }
+
+    /// Computes the residual blocks in integers from here on.
+    ///
+    /// # Errors
+    /// [`QuantiseError`] names the activation whose scale is missing.
+    pub fn quantise(&mut self, scales: &ActivationScales) -> Result<(), QuantiseError> {
+        let hidden = |input, output: Quantisation| LayerFormat { input, output: Some(output.scale), relu: true };
+        let last = |input| LayerFormat { input, output: None, relu: false };
+        let (mut before, mut blocks) = (scales.get(INWARD)?, Vec::with_capacity(self.blocks.len()));
+        for (number, [first, second, third]) in self.blocks.iter().enumerate() {
+            let of = |part| scales.get(&block_activation(number, part));
+            let (inner, innermost, output) = (of("0")?, of("1")?, of("output")?);
+            let layers = [
+                first.int8(hidden(before, inner))?,
+                second.int8(hidden(inner, innermost))?,
+                third.int8(last(innermost))?,
+            ];
+            blocks.push(Int8Block { input: before, layers });
+            before = output;
+        }
+        self.int8 = Some(blocks);
+        Ok(())
+    }
+
+    /// `[N, cell_channels + classes]`: features of cells beside the normalised logits of their sweeps.
+    fn input(&self, cells: &Tensor, logits: &Tensor) -> Result<Tensor, TchError> {
+        let norm = logits.f_square()?.f_sum_dim_intlist(1_i64, true, Kind::Float)?.f_add_scalar(1e-12)?.f_sqrt()?;
+        Tensor::f_cat(&[cells, &(logits / norm)], 1)
     }
 
     /// `[centres, 3]`: reference points of the cells' offsets, metres relative to the origin.

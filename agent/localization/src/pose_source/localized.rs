@@ -2,10 +2,10 @@
 
 use std::path::PathBuf;
 
+use perception::inference::Inference;
 use protocol::{NoPoseReason, PoseEstimate, StageTiming};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use tch::Device;
 
 use super::motion_gate::{MotionGate, MotionGateConfig};
 use super::{PoseInput, PoseSource};
@@ -50,21 +50,21 @@ pub struct LocalizedPose {
 }
 
 impl LocalizedPose {
-    /// Reads the networks of PGC, to compute with on the CPU.
+    /// Reads the networks of PGC.
     ///
     /// # Errors
     /// [`LocalizerError`] names the file and what is wrong with it.
-    pub fn pgc(config: &PgcConfig) -> Result<Self, LocalizerError> {
-        let localizer = Localizer::load(&config.encoder, &config.head, Device::Cpu)?;
+    pub fn pgc(config: &PgcConfig, inference: Inference) -> Result<Self, LocalizerError> {
+        let localizer = Localizer::load(&config.encoder, &config.head, inference)?;
         Ok(Self::new(Box::new(localizer), config.motion_gate.clone()))
     }
 
-    /// Reads a network that was trained end to end, to compute with on the CPU.
+    /// Reads a network that was trained end to end, which is computed in floating point.
     ///
     /// # Errors
     /// [`LocalizerError`] names the file and what is wrong with it.
-    pub fn end_to_end(config: &EndToEndPoseConfig) -> Result<Self, LocalizerError> {
-        let localizer = EndToEndLocalizer::load(&config.weights, Device::Cpu)?;
+    pub fn end_to_end(config: &EndToEndPoseConfig, inference: Inference) -> Result<Self, LocalizerError> {
+        let localizer = EndToEndLocalizer::load(&config.weights, inference.device)?;
         Ok(Self::new(Box::new(localizer), config.motion_gate.clone()))
     }
 

@@ -5,11 +5,11 @@
 
 use std::path::PathBuf;
 
+use perception::inference::Inference;
 use protocol::config::{FieldError, within};
 use protocol::{NoPoseReason, PlanarCovariance, PoseEstimate, StageTiming};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use tch::Device;
 
 use super::{PoseInput, PoseSource};
 use crate::pgc::{Localization, Localize, Localizer, LocalizerError};
@@ -103,12 +103,12 @@ pub struct TrackedPose {
 }
 
 impl TrackedPose {
-    /// Reads the networks, to compute with on the CPU.
+    /// Reads the networks.
     ///
     /// # Errors
     /// [`LocalizerError`] names the file and what is wrong with it.
-    pub fn load(config: &TrackedPoseConfig) -> Result<Self, LocalizerError> {
-        let localizer = Localizer::load(&config.encoder, &config.head, Device::Cpu)?;
+    pub fn load(config: &TrackedPoseConfig, inference: Inference) -> Result<Self, LocalizerError> {
+        let localizer = Localizer::load(&config.encoder, &config.head, inference)?;
         Ok(Self::new(Box::new(localizer), config.clone()))
     }
 

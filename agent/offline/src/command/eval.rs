@@ -19,6 +19,8 @@ use localization::pose_source::{PoseSource, TrackedPose, TrackedPoseConfig};
 use localization::registration::icp::IcpConfig;
 use localization::registration::ransac::RansacConfig;
 use localization::registration::sc2pcr::Sc2PcrConfig;
+use perception::inference::Inference;
+use perception::int8::InferencePrecision;
 use perception::train::cuda_device;
 use perception::weights::annotate;
 use protocol::config::Section;
@@ -105,6 +107,9 @@ pub(crate) struct Args {
     /// Device to compute on.
     #[arg(long, value_enum, default_value_t = ComputeOn::Cpu)]
     device: ComputeOn,
+    /// Number format in which networks are computed.
+    #[arg(long, value_enum, default_value_t)]
+    precision: InferencePrecision,
     /// Threads to compute with.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=256))]
     threads: u16,
@@ -178,11 +183,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
 impl Args {
     fn subject(&self, head: &Path) -> Result<Subject, BadInput> {
         if self.icp_map.is_empty() {
-            let device = match self.device {
-                ComputeOn::Cpu => Device::Cpu,
-                ComputeOn::Cuda => cuda_device().map_err(BadInput::of)?,
-            };
-            return Ok(Subject::Localizer(self.localizer(head, device).map_err(BadInput::of)?));
+            return Ok(Subject::Localizer(self.localizer(head, self.inference()?).map_err(BadInput::of)?));
         }
         if !self.map_spacing.is_finite() || self.map_spacing < 0.0 {
             return Err(BadInput::new(format!("--map-spacing is {}, must be 0 or more", self.map_spacing)));
@@ -192,24 +193,32 @@ impl Args {
         Ok(Subject::Source(Box::new(IcpMapPose::new(Arc::new(map), config))))
     }
 
+    fn inference(&self) -> Result<Inference, BadInput> {
+        let device = match self.device {
+            ComputeOn::Cpu => Device::Cpu,
+            ComputeOn::Cuda => cuda_device().map_err(BadInput::of)?,
+        };
+        Ok(Inference { device, precision: self.precision })
+    }
+
     fn tracking(&self, head: &Path) -> Result<Subject, BadInput> {
         let config = TrackedPoseConfig { encoder: self.encoder(head), head: head.to_owned(), ..self.tracker.0.clone() };
         config.validate().map_err(BadInput::of)?;
-        Ok(Subject::Source(Box::new(TrackedPose::load(&config).map_err(BadInput::of)?)))
+        Ok(Subject::Source(Box::new(TrackedPose::load(&config, self.inference()?).map_err(BadInput::of)?)))
     }
 
-    fn localizer(&self, head: &Path, device: Device) -> Result<Box<dyn Localize>, LocalizerError> {
+    fn localizer(&self, head: &Path, inference: Inference) -> Result<Box<dyn Localize>, LocalizerError> {
         let solver = match self.solver {
             Search::Ransac => Solver::Ransac(RansacConfig { seed: self.seed, ..RansacConfig::default() }),
             Search::Sc2pcr => Solver::Sc2Pcr(Sc2PcrConfig::default()),
         };
         if let Some(weights) = &self.end_to_end {
-            let mut localizer = EndToEndLocalizer::load(weights, device)?;
+            let mut localizer = EndToEndLocalizer::load(weights, inference.device)?;
             localizer.set_solver(PoseSolver { solver, ..PoseSolver::default() });
             return Ok(Box::new(localizer));
         }
         let load = if self.fit_confidence { Localizer::load_without_confidence } else { Localizer::load };
-        let mut localizer = load(&self.encoder(head), head, device)?;
+        let mut localizer = load(&self.encoder(head), head, inference)?;
         let confidence = localizer.solver().confidence.clone();
         localizer.set_solver(PoseSolver { solver, confidence });
         Ok(Box::new(localizer))

@@ -6,6 +6,8 @@ use dataset::{self, LeftOut, LoadOptions, Problem, Scenario};
 use indicatif::ProgressBar;
 use localization::pose_source::motion_gate::MotionGateConfig;
 use localization::pose_source::{LocalizedPose, PgcConfig, PoseInput, PoseRow, PoseSource, PoseTable};
+use perception::inference::Inference;
+use perception::int8::InferencePrecision;
 use protocol::PoseEstimate;
 use support::output;
 use support::progress;
@@ -30,6 +32,9 @@ pub(crate) struct Args {
     /// The table.
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
+    /// Number format in which networks are computed.
+    #[arg(long, value_enum, default_value_t)]
+    precision: InferencePrecision,
     /// Threads to compute with.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=256))]
     threads: u16,
@@ -78,8 +83,9 @@ impl Args {
         let motion_gate = MotionGateConfig::default();
         let config = PgcConfig { encoder: self.encoder.clone(), head: head.to_owned(), motion_gate };
         let mut rows: Vec<PoseRow<'_>> = Vec::new();
+        let inference = Inference { precision: self.precision, ..Inference::default() };
         for (agent, cav) in scenario.agents.iter().enumerate() {
-            let mut source = LocalizedPose::pgc(&config).map_err(bad)?;
+            let mut source = LocalizedPose::pgc(&config, inference).map_err(bad)?;
             for tick in (0..scenario.ticks.len()).filter(|&tick| scenario.is_present(agent, tick)) {
                 bar.inc(1);
                 let frame = match scenario.load(agent, tick, &LoadOptions::default()) {

@@ -2,5 +2,6 @@
 
 pub(crate) mod eval;
 pub(crate) mod localize;
+pub(crate) mod quantise;
 mod scene_heads;
 pub(crate) mod train;

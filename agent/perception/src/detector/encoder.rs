@@ -2,9 +2,7 @@
 
 use tch::{TchError, Tensor};
 
-use crate::int8::{
-    ActivationScales, CANVAS, Int8Backbone, Quantisation, QuantiseError, ScaleSearch, observe_backbone,
-};
+use crate::int8::{ActivationScales, CANVAS, Int8Backbone, Quantisation, QuantiseError, ScaleSearch, observe_backbone};
 use crate::layers::backbone::BevBackbone;
 use crate::layers::shrink::Shrink;
 use crate::pillars::batch::PillarGrid;

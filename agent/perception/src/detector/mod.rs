@@ -21,8 +21,8 @@ use output::flat;
 use crate::boxes::anchors::Anchors;
 use crate::boxes::decode::{Decoded, decode};
 use crate::crop::Crop;
-use crate::layers::head::DetectionHead;
 use crate::int8::ScaleSearch;
+use crate::layers::head::DetectionHead;
 use crate::layers::shrink::{Compressor, Shrink};
 use crate::model_config::{DetectorConfig, YAxis};
 use crate::pillars::point_pillars::PointPillars;
@@ -327,6 +327,7 @@ mod tests {
     use std::collections::BTreeMap;
 
     use super::*;
+    use crate::int8::{InferencePrecision, SCALES_KEY};
     use crate::pillars::batch::PillarBatch;
     use crate::weights::{self, CONFIG_KEY, Precision};
 
@@ -357,6 +358,42 @@ mod tests {
     fn cloud() -> PointCloud {
         let points = (0..4000).map(|k| [(k % 89) as f32 * 0.3 - 13.0, (k % 53) as f32 * 0.25 - 6.5, -1.0, 0.4]);
         PointCloud { xyzi: points.collect() }
+    }
+
+    #[test]
+    fn integers_change_its_feature_maps_little() {
+        let (store, pillars) = network();
+        let (mut float, cloud) = (Detector::from_network(pillars), cloud());
+        let expected = float.encode(&cloud).unwrap().features;
+        let mut search = ScaleSearch::default();
+        float.observe(&cloud, &mut search).unwrap();
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("w.safetensors");
+        let scales = serde_json::to_string(&search.scales()).unwrap();
+        let config = serde_json::to_string(&config()).unwrap();
+        let metadata: BTreeMap<_, _> =
+            [(CONFIG_KEY, config), (SCALES_KEY, scales)].map(|(key, value)| (key.to_owned(), value)).into();
+        weights::save(&path, &store, &metadata, Precision::Single).unwrap();
+        let found = Detector::load(&path).unwrap().encode(&cloud).unwrap().features;
+        let error = (&found - &expected).square().mean(Kind::Float).sqrt().double_value(&[]);
+        assert!(found.is_contiguous() && error > 0.0, "{error}");
+        assert!(error < 0.06 * expected.std(true).double_value(&[]), "{error}");
+        let weights = Weights::load(&path).unwrap().with_precision(InferencePrecision::Float);
+        let mut again = Detector::from_weights(&weights, &weights.config().unwrap()).unwrap();
+        assert!(again.encode(&cloud).unwrap().features.equal(&expected));
+    }
+
+    #[test]
+    fn a_missing_scale_is_named_with_its_file() {
+        let (store, _) = network();
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("w.safetensors");
+        let config = serde_json::to_string(&config()).unwrap();
+        let metadata: BTreeMap<_, _> =
+            [(CONFIG_KEY, config), (SCALES_KEY, "{}".to_owned())].map(|(key, value)| (key.to_owned(), value)).into();
+        weights::save(&path, &store, &metadata, Precision::Single).unwrap();
+        let message = Detector::load(&path).unwrap_err().to_string();
+        assert!(message.contains("w.safetensors") && message.contains("pillar_vfe.canvas"), "{message}");
     }
 
     #[test]

@@ -19,8 +19,8 @@ mod scale;
 mod scale_search;
 mod weight;
 
-pub use activation_scales::{ActivationScales, SCALES_KEY};
 pub use activation_scales::MissingScale;
+pub use activation_scales::{ActivationScales, SCALES_KEY};
 pub use backbone::{CANVAS, Int8Backbone, QuantiseError, observe_backbone};
 pub use convolution::{ConvGeometry, Int8Convolution};
 pub use layer::LayerFormat;

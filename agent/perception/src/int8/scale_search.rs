@@ -94,7 +94,7 @@ mod tests {
         tch::manual_seed(1);
         let mut search = ScaleSearch::default();
         let even = Tensor::rand([100_000], (Kind::Float, Device::Cpu));
-        let mut outlier = even.copy();
+        let outlier = even.copy();
         let _ = outlier.get(0).fill_(3.0);
         for (name, values) in [("even", &even), ("outlier", &outlier), ("signed", &(&even - 0.5))] {
             search.observe(name, values).unwrap();

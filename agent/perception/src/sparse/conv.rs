@@ -3,7 +3,9 @@
 use tch::nn::{self, Init};
 use tch::{TchError, Tensor};
 
+use super::int8_conv::Int8SparseConv;
 use super::rulebook::{GatherIndex, KERNEL_VOLUME};
+use crate::int8::LayerFormat;
 
 /// A 3x3x3 convolution over sites, with bias.
 #[derive(Debug)]
@@ -28,16 +30,18 @@ impl SparseConv {
     /// # Errors
     /// Those of the tensor library, for example when the rows are not those of the rulebook.
     pub fn forward(&self, x: &Tensor, index: &GatherIndex) -> Result<Tensor, TchError> {
-        let (rows, channels) = x.size2()?;
-        if rows != index.inputs {
-            return Err(TchError::Shape(format!("{rows} rows of features, the rulebook is of {}", index.inputs)));
-        }
-        // A row of zeros stands for all missing neighbours.
-        let padded = Tensor::f_cat(&[x, &x.f_new_zeros([1, channels], (x.kind(), x.device()))?], 0)?;
-        // With an index that is expanded and not materialised, gather and its gradient copy whole rows.
-        let gathered = padded.f_gather(0, &index.rows.f_unsqueeze(1)?.f_expand([-1, channels], false)?, false)?;
-        let columns = gathered.f_view([-1, KERNEL_VOLUME as i64 * channels])?;
+        let columns = index.gather(x)?.f_view([-1, KERNEL_VOLUME as i64 * x.size2()?.1])?;
         self.bias.to_kind(x.kind()).f_addmm(&columns, &self.weight.to_kind(x.kind()))
+    }
+}
+
+impl SparseConv {
+    /// The same in integers, see [`Int8SparseConv`].
+    ///
+    /// # Errors
+    /// Those of the tensor library; [`TchError::Shape`] unless the input channels are a multiple of four.
+    pub fn int8(&self, format: LayerFormat) -> Result<Int8SparseConv, TchError> {
+        Int8SparseConv::new(&self.weight, &self.bias, format)
     }
 }
 
@@ -48,6 +52,7 @@ mod tests {
     use tch::{Device, IndexOp, Kind};
 
     use super::*;
+    use crate::int8::{Quantisation, Scale};
     use crate::sparse::{Rulebook, Sites};
 
     const SIZE: i64 = 6;
@@ -118,6 +123,26 @@ mod tests {
         fn equals_dense_convolution_at_stride_2(occupied in occupancy(), seed in 0..1000_i64) {
             prop_assert!(agrees(occupied, 2, seed));
         }
+    }
+
+    #[test]
+    fn integers_give_nearly_the_same() {
+        tch::set_num_threads(1);
+        tch::manual_seed(6);
+        let (sites, _) = Sites::collect((0..60).map(|k| [k % 5, k / 5 % 4, k / 20]));
+        let index = Rulebook::stacked([&Rulebook::submanifold(&sites)], Device::Cpu).unwrap();
+        let network = VarStore::new(Device::Cpu);
+        let conv = SparseConv::new(&network.root(), 8, 12);
+        let input = Quantisation::unsigned(Scale::of_exponent(-6));
+        let x = Tensor::rand([sites.len() as i64, 8], (Kind::Float, Device::Cpu)) * 3.0;
+        let expected = tch::no_grad(|| conv.forward(&x, &index).unwrap());
+        let int8 = tch::no_grad(|| conv.int8(LayerFormat { input, output: None, relu: false })).unwrap();
+        let found = int8.forward(&input.quantise(&x).unwrap(), &index).unwrap();
+        let error = (&found - &expected).square().mean(Kind::Float).sqrt().double_value(&[]);
+        assert!(error > 0.0 && error < 0.02 * expected.std(true).double_value(&[]), "{error}");
+        let odd = SparseConv::new(&(network.root() / "odd"), 3, 4);
+        let message = odd.int8(LayerFormat { input, output: None, relu: false }).unwrap_err().to_string();
+        assert!(message.contains("3 input channels"), "{message}");
     }
 
     #[test]

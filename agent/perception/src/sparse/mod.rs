@@ -7,9 +7,11 @@
 //! if its cell of 2x2x2 sites has one.
 
 mod conv;
+mod int8_conv;
 mod rulebook;
 mod sites;
 
 pub use conv::SparseConv;
+pub use int8_conv::Int8SparseConv;
 pub use rulebook::{GatherIndex, KERNEL_VOLUME, Rulebook};
 pub use sites::Sites;

@@ -101,9 +101,26 @@ impl Rulebook {
 #[derive(Debug)]
 pub struct GatherIndex {
     /// Number of input rows; also the mark of a missing neighbour.
-    pub(super) inputs: i64,
+    inputs: i64,
     /// `[outputs * 27]` of input rows, `i64`.
-    pub(super) rows: Tensor,
+    rows: Tensor,
+}
+
+impl GatherIndex {
+    /// The neighbours of every output, `[N_out * 27, C]`, of features `[N_in, C]`: zeros where there is none.
+    ///
+    /// # Errors
+    /// [`TchError::Shape`] when the rows are not those of the rulebook.
+    pub(super) fn gather(&self, x: &Tensor) -> Result<Tensor, TchError> {
+        let (rows, channels) = x.size2()?;
+        if rows != self.inputs {
+            return Err(TchError::Shape(format!("{rows} rows of features, the rulebook is of {}", self.inputs)));
+        }
+        // A row of zeros stands for all missing neighbours.
+        let padded = Tensor::f_cat(&[x, &x.f_new_zeros([1, channels], (x.kind(), x.device()))?], 0)?;
+        // With an index that is expanded and not materialised, gather and its gradient copy whole rows.
+        padded.f_gather(0, &self.rows.f_unsqueeze(1)?.f_expand([-1, channels], false)?, false)
+    }
 }
 
 fn offset(k: usize) -> [i32; 3] {

@@ -16,6 +16,7 @@ use ego_fuser_offline::evaluation::alignment::{self, BoxSource};
 use localization::pose_source::{PoseSource, PoseSourceConfig, RecordedPose};
 use localization::registration::icp::IcpConfig;
 use perception::detector::Detector;
+use perception::inference::Inference;
 use protocol::CavId;
 use support::output;
 use support::progress;
@@ -191,6 +192,6 @@ fn from_source(source: &NamedSource) -> Result<AlignmentSpec> {
     let text = std::fs::read_to_string(file).map_err(|error| bad(&error))?;
     let config: PoseSourceConfig = serde_saphyr::from_str(&text).map_err(|error| bad(&error))?;
     // Built once without use, so that a missing file is found before the first scene.
-    config.build().map_err(|error| bad(&error))?;
-    Ok(Poses::spec(name.clone(), Measured::True, move || config.build()))
+    config.build(Inference::default()).map_err(|error| bad(&error))?;
+    Ok(Poses::spec(name.clone(), Measured::True, move || config.build(Inference::default())))
 }

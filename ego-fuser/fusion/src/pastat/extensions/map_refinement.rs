@@ -118,4 +118,24 @@ mod tests {
         assert!(largest(&single) > 0.1);
         assert!(largest(&(&single - half)) < 0.02 * largest(&single));
     }
+
+    #[test]
+    fn integers_change_little_and_training_stays_in_floating_point() {
+        tch::set_num_threads(1);
+        tch::manual_seed(2);
+        let variables = VarStore::new(Device::Cpu);
+        let mut refinement = MapRefinement::new(&variables.root(), 8, 12);
+        let fused = Tensor::rand([1, 8, 16, 24], (Kind::Float, Device::Cpu)) * 4.0 - 0.5;
+        let weight = &variables.variables()["refine.conv1.weight"];
+        let _ = tch::no_grad(|| weight.shallow_clone().normal_(0.0, 0.1));
+        let (exact, mut search) = (refinement.forward(&fused, true).unwrap(), ScaleSearch::default());
+        tch::no_grad(|| refinement.observe(&fused, &mut search)).unwrap();
+        tch::no_grad(|| refinement.quantise(&search.scales())).unwrap();
+        let found = tch::no_grad(|| refinement.forward(&fused, false)).unwrap();
+        let error = (&found - &exact).square().mean(Kind::Float).sqrt().double_value(&[]);
+        assert!(error > 0.0 && error < 0.03 * (&exact - &fused).std(true).double_value(&[]), "{error}");
+        assert_eq!(refinement.forward(&fused, true).unwrap(), exact);
+        let missing = MapRefinement::new(&variables.root(), 8, 12).quantise(&Default::default()).unwrap_err();
+        assert!(missing.to_string().contains("fusion.refine.input"), "{missing}");
+    }
 }

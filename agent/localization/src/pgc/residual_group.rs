@@ -1,0 +1,110 @@
+//! Residual group of sparse convolutions, in floating point and in 8-bit integers.
+
+use tch::nn::{self, Init};
+use tch::{TchError, Tensor};
+
+use perception::int8::{ActivationScales, Int8Linear, LayerFormat, Quantisation, QuantiseError};
+use perception::sparse::{GatherIndex, Int8SparseConv, SparseConv};
+
+/// Called with the name and the values of an activation.
+pub(super) type OnActivation<'a> = dyn FnMut(&str, &Tensor) -> Result<(), TchError> + 'a;
+
+/// Two 3x3x3 convolutions with a 1x1 one between them, and a skip connection.
+#[derive(Debug)]
+pub(super) struct ResidualGroup {
+    inward: SparseConv,
+    /// `[C_out, C_out]`.
+    middle: Tensor,
+    middle_bias: Tensor,
+    outward: SparseConv,
+    /// `[C_in, C_out]`; `None` if both are the same.
+    skip: Option<Tensor>,
+}
+
+/// A residual group in integers.
+#[derive(Debug)]
+pub(super) struct Int8ResidualGroup {
+    input: Quantisation,
+    inward: Int8SparseConv,
+    middle: Int8Linear,
+    outward: Int8SparseConv,
+    skip: Option<Int8Linear>,
+}
+
+impl ResidualGroup {
+    pub(super) fn new(path: &nn::Path<'_>, inputs: i64, outputs: i64) -> Self {
+        let pointwise = |name: &str, from: i64| {
+            let stdev = (2.0 / from as f64).sqrt();
+            (path / name).var("weight", &[from, outputs], Init::Randn { mean: 0.0, stdev })
+        };
+        Self {
+            inward: SparseConv::new(&(path / "inward"), inputs, outputs),
+            middle: pointwise("middle", outputs),
+            middle_bias: (path / "middle").var("bias", &[outputs], Init::Const(0.0)),
+            outward: SparseConv::new(&(path / "outward"), outputs, outputs),
+            skip: (inputs != outputs).then(|| pointwise("skip", inputs)),
+        }
+    }
+
+    /// `[N, C_in]` to `[N, C_out]`, not negative. `on_activation` gets those within, below `name`.
+    pub(super) fn forward(
+        &self,
+        x: &Tensor,
+        index: &GatherIndex,
+        name: &str,
+        on_activation: &mut OnActivation<'_>,
+    ) -> Result<Tensor, TchError> {
+        let kind = x.kind();
+        let inner = self.inward.forward(x, index)?.f_relu()?;
+        on_activation(&inward_activation(name), &inner)?;
+        let inner = self.middle_bias.to_kind(kind).f_addmm(&inner, &self.middle.to_kind(kind))?.f_relu()?;
+        on_activation(&middle_activation(name), &inner)?;
+        let inner = self.outward.forward(&inner, index)?;
+        match &self.skip {
+            Some(skip) => (inner + x.f_matmul(&skip.to_kind(kind))?).f_relu(),
+            None => (inner + x).f_relu(),
+        }
+    }
+
+    /// The same in integers, its activations below `name`.
+    pub(super) fn int8(
+        &self,
+        input: Quantisation,
+        name: &str,
+        scales: &ActivationScales,
+    ) -> Result<Int8ResidualGroup, QuantiseError> {
+        let (inward, middle) = (scales.get(&inward_activation(name))?, scales.get(&middle_activation(name))?);
+        let hidden = |input, output: Quantisation| LayerFormat { input, output: Some(output.scale), relu: true };
+        let last = |input| LayerFormat { input, output: None, relu: false };
+        let linear = |weight: &Tensor, bias: Option<&Tensor>, format| {
+            Int8Linear::new(&weight.f_tr()?.f_contiguous()?, bias, format)
+        };
+        Ok(Int8ResidualGroup {
+            input,
+            inward: self.inward.int8(hidden(input, inward))?,
+            middle: linear(&self.middle, Some(&self.middle_bias), hidden(inward, middle))?,
+            outward: self.outward.int8(last(middle))?,
+            skip: self.skip.as_ref().map(|skip| linear(skip, None, last(input))).transpose()?,
+        })
+    }
+}
+
+impl Int8ResidualGroup {
+    /// `[N, C_in]`, `u8`, to `[N, C_out]`, `f32` and not negative.
+    pub(super) fn forward(&self, x: &Tensor, index: &GatherIndex) -> Result<Tensor, TchError> {
+        let inner = self.middle.forward(&self.inward.forward(x, index)?)?;
+        let skipped = match &self.skip {
+            Some(skip) => skip.forward(x)?,
+            None => self.input.dequantise(x)?,
+        };
+        self.outward.forward(&inner, index)?.f_add_(&skipped)?.f_relu_()
+    }
+}
+
+fn inward_activation(name: &str) -> String {
+    format!("{name}.inward")
+}
+
+fn middle_activation(name: &str) -> String {
+    format!("{name}.middle")
+}

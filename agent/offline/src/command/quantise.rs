@@ -1,0 +1,58 @@
+//! `agent quantise`: scales of activations of scene encoder and head for 8-bit inference, stored in the head's file.
+
+use std::path::PathBuf;
+
+use dataset::{LeftOut, LoadOptions};
+use localization::pgc::Localizer;
+use perception::inference::Inference;
+use perception::int8::{SCALES_KEY, ScaleSearch};
+use perception::weights::annotate;
+use support::cli::{BadInput, Outcome};
+use support::output;
+
+/// Search the scales of activations on a few training sweeps of a scene and store them in its head, which is then
+/// computed in 8-bit integers, as is its encoder.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// Data sets, splits or scenarios of the scene.
+    #[arg(long, value_name = "DIR", num_args = 1.., required = true)]
+    scene: Vec<PathBuf>,
+    /// Weights of the encoder.
+    #[arg(long, value_name = "FILE")]
+    encoder: PathBuf,
+    /// Weights of the head; its parameters stay as they are.
+    #[arg(long, value_name = "FILE")]
+    head: PathBuf,
+    /// Number of sweeps of every scenario, evenly over its ticks and vehicles.
+    #[arg(long, value_name = "N", default_value_t = 10, value_parser = clap::value_parser!(u16).range(1..))]
+    sweeps: u16,
+}
+
+/// Searches the scales and stores them.
+pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
+    tch::set_num_threads(1);
+    let localizer = Localizer::load(&args.encoder, &args.head, Inference::FLOAT).map_err(BadInput::of)?;
+    let (mut search, mut left_out, mut observed) = (ScaleSearch::default(), LeftOut::default(), 0);
+    for folder in &args.scene {
+        for scenario in dataset::open(folder).map_err(BadInput::of)?.scenarios {
+            let all = scenario.ticks.len() * scenario.agents.len();
+            for sweep in (0..all).step_by(all.div_ceil(usize::from(args.sweeps)).max(1)) {
+                let (tick, agent) = (sweep / scenario.agents.len(), sweep % scenario.agents.len());
+                let loaded = scenario.load_tick(tick, agent..agent + 1, &LoadOptions::default());
+                left_out.add_tick(&loaded);
+                for (_, frame) in &loaded.frames {
+                    localizer.observe(&frame.points, &mut search)?;
+                    observed += 1;
+                }
+            }
+        }
+    }
+    let scales = search.scales();
+    if scales.is_empty() {
+        return Err(BadInput::new(format!("none of {observed} sweeps has cells: nothing to search scales on")).into());
+    }
+    let sha256 = annotate(&args.head, SCALES_KEY, &serde_json::to_string(&scales)?).map_err(BadInput::of)?;
+    let (head, activations) = (args.head.display(), scales.len());
+    output::line(format_args!("{head}: {activations} activations of {observed} sweeps, SHA-256 {sha256}"))?;
+    Ok(left_out.print())
+}

@@ -1,0 +1,40 @@
+//! Sparse 3-D convolution in 8-bit integers.
+
+use tch::{Kind, TchError, Tensor};
+
+use super::rulebook::{GatherIndex, KERNEL_VOLUME};
+use crate::int8::{Int8Linear, LayerFormat};
+
+/// Bytes of the values by which rows are gathered.
+const WORD_BYTES: i64 = 4;
+
+/// A 3x3x3 convolution over sites of `u8` features that are never negative.
+#[derive(Debug)]
+pub struct Int8SparseConv {
+    linear: Int8Linear,
+}
+
+impl Int8SparseConv {
+    /// Quantises a weight `[27 * C_in, C_out]` with bias `[C_out]`.
+    ///
+    /// # Errors
+    /// Those of the tensor library; [`TchError::Shape`] unless `C_in` is a multiple of four.
+    pub(super) fn new(weight: &Tensor, bias: &Tensor, format: LayerFormat) -> Result<Self, TchError> {
+        let inputs = weight.size2()?.0 / KERNEL_VOLUME as i64;
+        if inputs % WORD_BYTES != 0 {
+            return Err(TchError::Shape(format!("{inputs} input channels, must be a multiple of {WORD_BYTES}")));
+        }
+        Ok(Self { linear: Int8Linear::new(&weight.f_tr()?.f_contiguous()?, Some(bias), format)? })
+    }
+
+    /// `[N_in, C_in]`, `u8`, to `[N_out, C_out]`.
+    ///
+    /// # Errors
+    /// Those of the tensor library, for example when the rows are not those of the rulebook.
+    pub fn forward(&self, x: &Tensor, index: &GatherIndex) -> Result<Tensor, TchError> {
+        let channels = x.size2()?.1;
+        // The library gathers rows of floats many times faster than rows of bytes; nothing is computed with them here.
+        let words = index.gather(&x.f_view_dtype(Kind::Float)?)?;
+        self.linear.forward(&words.f_view_dtype(Kind::Uint8)?.f_view([-1, KERNEL_VOLUME as i64 * channels])?)
+    }
+}
