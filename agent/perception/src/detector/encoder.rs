@@ -2,7 +2,8 @@
 
 use tch::{TchError, Tensor};
 
-use crate::int8::{ActivationScales, CANVAS, Int8Backbone, Quantisation, QuantiseError, ScaleSearch, observe_backbone};
+use super::int8_backbone::{CANVAS, Int8Backbone, observe_backbone};
+use crate::int8::{ActivationScales, Quantisation, QuantiseError, ScaleSearch};
 use crate::layers::backbone::BevBackbone;
 use crate::layers::shrink::Shrink;
 use crate::pillars::batch::PillarGrid;

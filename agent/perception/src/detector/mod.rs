@@ -2,6 +2,7 @@
 
 mod encoder;
 mod error;
+mod int8_backbone;
 mod output;
 
 use std::path::Path;

@@ -9,8 +9,8 @@
 //! file ([`ActivationScales`]); its parameters stay in floating point.
 
 mod activation_scales;
-mod backbone;
 mod convolution;
+mod error;
 mod layer;
 mod linear;
 mod operators;
@@ -21,8 +21,8 @@ mod weight;
 
 pub use activation_scales::MissingScale;
 pub use activation_scales::{ActivationScales, SCALES_KEY};
-pub use backbone::{CANVAS, Int8Backbone, QuantiseError, observe_backbone};
 pub use convolution::{ConvGeometry, Int8Convolution};
+pub use error::QuantiseError;
 pub use layer::LayerFormat;
 pub use linear::Int8Linear;
 pub use precision::InferencePrecision;

@@ -2,32 +2,19 @@
 
 use tch::{TchError, Tensor};
 
-use super::activation_scales::{ActivationScales, MissingScale};
-use super::convolution::Int8Convolution;
-use super::scale_search::ScaleSearch;
+use crate::int8::{ActivationScales, Int8Convolution, QuantiseError, ScaleSearch};
 use crate::layers::backbone::BevBackbone;
 use crate::layers::convolution::{ConvLayer, contiguous_map};
 use crate::layers::shrink::Shrink;
 
 /// Name of the canvas among the activations.
-pub const CANVAS: &str = "pillar_vfe.canvas";
+pub(super) const CANVAS: &str = "pillar_vfe.canvas";
 /// Name of the up-sampled levels, which are concatenated and therefore share a scale.
 const UPSAMPLED: &str = "backbone.upsampled";
 
-/// Error of quantising a network.
-#[derive(Debug, thiserror::Error)]
-pub enum QuantiseError {
-    /// The weights file lacks the scale of an activation.
-    #[error(transparent)]
-    Scale(#[from] MissingScale),
-    /// The tensor library failed.
-    #[error("tensor library: {0}")]
-    Tensor(#[from] TchError),
-}
-
 /// Backbone of plain blocks with a shrink layer, in integers.
 #[derive(Debug)]
-pub struct Int8Backbone {
+pub(super) struct Int8Backbone {
     blocks: Vec<Vec<Int8Convolution>>,
     deblocks: Vec<Int8Convolution>,
     /// The last of them gives `f32`.
@@ -40,7 +27,7 @@ impl Int8Backbone {
     ///
     /// # Errors
     /// [`QuantiseError`] names the activation whose scale is missing.
-    pub fn new(
+    pub(super) fn new(
         backbone: &BevBackbone,
         shrink: Option<&Shrink>,
         scales: &ActivationScales,
@@ -75,7 +62,7 @@ impl Int8Backbone {
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub fn forward(&self, canvas: &Tensor) -> Result<Tensor, TchError> {
+    pub(super) fn forward(&self, canvas: &Tensor) -> Result<Tensor, TchError> {
         let mut x = canvas.shallow_clone();
         let mut levels = Vec::with_capacity(self.blocks.len());
         for (block, deblock) in self.blocks.iter().zip(&self.deblocks) {
@@ -103,7 +90,7 @@ fn shrink_activation(position: usize) -> String {
 ///
 /// # Errors
 /// Those of the tensor library.
-pub fn observe_backbone(
+pub(super) fn observe_backbone(
     backbone: &BevBackbone,
     shrink: Option<&Shrink>,
     canvas: &Tensor,
