@@ -19,8 +19,8 @@ const YAW_ACCELERATION_STD: f64 = 0.8;
 const RESIDUAL_YAW_ACCELERATION_STD: f64 = 0.25;
 /// Standard deviation of the side slip after one second, metres.
 const SLIP_STD_M: f64 = 0.05;
-/// Standard deviation of the vertical acceleration, metres per second squared.
-const VERTICAL_ACCELERATION_STD: f64 = 0.5;
+/// Standard deviation of the vertical acceleration beside that of the slope, metres per second squared.
+const VERTICAL_ACCELERATION_STD: f64 = 0.1;
 /// Standard deviation of a measured speed, metres per second: OpenCDA's 0.2 and the error of a wheel's radius.
 const SPEED_STD_MPS: f64 = 0.25;
 /// Standard deviation of a measured yaw rate without its bias, radians per second: 0.1 degrees/s, as of a MEMS gyroscope.
@@ -58,7 +58,7 @@ pub(super) struct MotionFilter {
     /// gyroscope (rad/s), and the LiDAR's place ahead of the rear axle (metres).
     state: State,
     covariance: Covariance,
-    /// Height (metres, world) and vertical speed (m/s).
+    /// Height (metres, world) and vertical speed beside that of the slope (m/s).
     height: Vector2<f64>,
     height_covariance: Matrix2<f64>,
     roll_rad: f64,
@@ -133,7 +133,9 @@ impl MotionFilter {
     fn advance_height(&mut self, time_s: f64) {
         let step = Matrix2::new(1.0, time_s, 0.0, 1.0);
         let lifted = Vector2::new(time_s * time_s / 2.0, time_s) * VERTICAL_ACCELERATION_STD;
-        self.height = step * self.height;
+        // Nose down is a positive pitch.
+        let climbed_m = -self.state[SPEED] * self.pitch_rad.sin() * time_s;
+        self.height = step * self.height + Vector2::new(climbed_m, 0.0);
         self.height_covariance = step * self.height_covariance * step.transpose() + lifted * lifted.transpose();
     }
 
