@@ -341,9 +341,9 @@ mod tests {
             let measured = steps.take(44).enumerate().skip(4).filter(|(_, (_, is_measured))| *is_measured);
             measured.map(|(sweep, _)| sweep).collect::<Vec<_>>()
         };
-        for phase in 0..8 {
-            let expected: Vec<usize> = (4..44).filter(|sweep| (sweep + phase).is_multiple_of(4)).collect();
-            assert_eq!(measured(phase as u32), expected, "phase {phase}");
+        for (phase, turn) in (0u32..8).zip(0usize..) {
+            let expected: Vec<usize> = (4..44).filter(|sweep| (sweep + turn).is_multiple_of(4)).collect();
+            assert_eq!(measured(phase), expected, "phase {phase}");
         }
         let estimates: Vec<_> = steps(road(), TrackedPoseConfig::default(), Some(0.0)).take(44).collect();
         for (sweep, (estimate, _)) in estimates.iter().enumerate() {
