@@ -11,19 +11,21 @@ use crate::WireError;
 pub struct EgoMotion {
     /// Speed along the heading, metres per second; negative backwards.
     pub speed_mps: Option<f64>,
-    /// Yaw rate, radians per second, counter-clockwise.
+    /// Yaw rate, radians per second, counter-clockwise: the mean since the last message, as a gyroscope that integrates
+    /// between two messages gives it.
     pub yaw_rate_rad_s: Option<f64>,
 }
 
-/// Largest speed of a message, metres per second.
-const MAX_SPEED_MPS: f64 = 200.0;
-/// Largest yaw rate of a message, radians per second.
-const MAX_YAW_RATE_RAD_S: f64 = 20.0;
-
 impl EgoMotion {
+    /// Largest speed of a message, metres per second.
+    pub const MAX_SPEED_MPS: f64 = 200.0;
+    /// Largest yaw rate of a message, radians per second.
+    pub const MAX_YAW_RATE_RAD_S: f64 = 20.0;
+
     fn check_values(&self, _: &Limits) -> Result<(), WireError> {
-        check_within("speed_mps", self.speed_mps.unwrap_or(0.0), -MAX_SPEED_MPS, MAX_SPEED_MPS)?;
-        check_within("yaw_rate_rad_s", self.yaw_rate_rad_s.unwrap_or(0.0), -MAX_YAW_RATE_RAD_S, MAX_YAW_RATE_RAD_S)
+        let [speed, yaw_rate] = [Self::MAX_SPEED_MPS, Self::MAX_YAW_RATE_RAD_S];
+        check_within("speed_mps", self.speed_mps.unwrap_or(0.0), -speed, speed)?;
+        check_within("yaw_rate_rad_s", self.yaw_rate_rad_s.unwrap_or(0.0), -yaw_rate, yaw_rate)
     }
 }
 

@@ -4,7 +4,7 @@
 use std::collections::HashMap;
 use std::path::Path;
 
-use protocol::{Pose, PoseError};
+use protocol::{EgoMotion, Handedness, Pose, PoseError};
 
 use super::yaml::{Field, Value};
 use super::{Problem, ReadError, classes};
@@ -17,7 +17,7 @@ const KMH_PER_MPS: f64 = 3.6;
 const MAX_HALF_SIZE_M: f64 = 50.0;
 /// Largest angle, degrees: sums of turns occur in files, larger values are errors.
 const MAX_ANGLE_DEG: f64 = 1e5;
-/// Largest speed, metres per second.
+/// Largest speed of an object, metres per second.
 const MAX_SPEED_MPS: f64 = 1000.0;
 /// Keys of an object's type in related formats; the first key present is used.
 const CLASS_KEYS: [&str; 4] = ["obj_type", "object_type", "class", "type"];
@@ -58,6 +58,23 @@ impl<'a> Annotations<'a> {
         let field = keys.iter().find_map(|key| parent.optional(key).ok().flatten())?;
         let value = read(&field).map_err(|error| self.left_out("field", error));
         value.ok()
+    }
+
+    /// The vehicle's own motion: what its sensors measured (`imu` of generated scenes), and otherwise its `ego_speed`. A
+    /// yaw rate of left-handed files is clockwise.
+    pub(super) fn motion(&mut self, handedness: Handedness) -> EgoMotion {
+        let imu = self.root.optional("imu").ok().flatten();
+        let mut measured = |key, read: &dyn Fn(&Field<'a>) -> Result<f64, ReadError>| {
+            imu.as_ref().and_then(|imu| self.optional_of(imu, &[key], read))
+        };
+        let counter_clockwise = if handedness == Handedness::Left { -1.0 } else { 1.0 };
+        let yaw_rate_rad_s = measured("yaw_rate_degps", &|field| {
+            let most_degps = EgoMotion::MAX_YAW_RATE_RAD_S.to_degrees();
+            Ok(counter_clockwise * within(field, field.number()?, most_degps, "degrees/s")?.to_radians())
+        });
+        let speed_mps = measured("speed_mps", &|field| own_speed_mps(field, field.number()?));
+        let recorded = |field: &Field<'a>| own_speed_mps(field, speed_mps_of_kmh(field)?);
+        EgoMotion { speed_mps: speed_mps.or_else(|| self.optional(&["ego_speed"], recorded)), yaw_rate_rad_s }
     }
 
     /// All valid objects. `id` gives the id of an object of the listed number, `pose` transforms its pose from the file
@@ -169,16 +186,28 @@ fn size_m(field: &Field<'_>) -> Result<[f64; 3], ReadError> {
     Ok(half.map(|half| 2.0 * half))
 }
 
+/// Speed of an object, metres per second.
+fn speed_mps(field: &Field<'_>) -> Result<f64, ReadError> {
+    within(field, speed_mps_of_kmh(field)?, MAX_SPEED_MPS, "m/s")
+}
+
+/// Speed of the vehicle itself, metres per second.
+fn own_speed_mps(field: &Field<'_>, speed_mps: f64) -> Result<f64, ReadError> {
+    within(field, speed_mps, EgoMotion::MAX_SPEED_MPS, "m/s")
+}
+
 /// km/h to m/s. Related formats write a vector; its length is the speed.
-pub(super) fn speed_mps(field: &Field<'_>) -> Result<f64, ReadError> {
-    let kmh = match field.number() {
-        Ok(kmh) => kmh,
-        Err(error) => {
-            let vector = field.array().map_err(|_| error)?.values;
-            vector.iter().map(|component| component * component).sum::<f64>().sqrt()
-        }
-    };
-    let mps = kmh / KMH_PER_MPS;
+fn speed_mps_of_kmh(field: &Field<'_>) -> Result<f64, ReadError> {
+    let kmh = field.number().or_else(|error| {
+        let vector = field.array().map_err(|_| error)?.values;
+        Ok(vector.iter().map(|component| component * component).sum::<f64>().sqrt())
+    });
+    Ok(kmh? / KMH_PER_MPS)
+}
+
+/// The value, if its size is at most `most`.
+fn within(field: &Field<'_>, value: f64, most: f64, unit: &str) -> Result<f64, ReadError> {
     // NaN does not satisfy this comparison.
-    if mps.abs() <= MAX_SPEED_MPS { Ok(mps) } else { Err(field.error(format!("{kmh} km/h is no speed"))) }
+    let is_within = value.abs() <= most;
+    if is_within { Ok(value) } else { Err(field.error(format!("{value} {unit}, expected at most {most:.0}"))) }
 }

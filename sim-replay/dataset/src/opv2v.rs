@@ -5,10 +5,10 @@
 
 use std::path::PathBuf;
 
-use protocol::{CavId, Handedness, Pose, PoseError};
+use protocol::{CavId, EgoMotion, Handedness, Pose, PoseError};
 
 use super::agent_folders::ScenarioFolder;
-use super::annotations::{Annotations, speed_mps};
+use super::annotations::Annotations;
 use super::points::Sweeps;
 use super::written_pose::WrittenPose;
 use super::yaml::{self, Field};
@@ -58,11 +58,13 @@ impl Opv2v {
         let pose = |field: &Field<'_>| self.six_numbers(field);
         let world_from_lidar = root.optional("lidar_pose")?.map(|field| pose(&field)).transpose()?;
         let mut annotations = Annotations::new(root);
+        let EgoMotion { speed_mps, yaw_rate_rad_s } = annotations.motion(self.handedness);
         Ok(Frame {
             world_from_lidar,
             world_from_vehicle: annotations.optional(&["true_ego_pos", "true_ego_pose"], pose),
             gnss_world_from_vehicle: annotations.optional(&["predicted_ego_pos", "predicted_ego_pose"], pose),
-            speed_mps: annotations.optional(&["ego_speed"], speed_mps),
+            speed_mps,
+            yaw_rate_rad_s,
             objects: annotations.objects(|id, _| Ok(id), |place| self.world_from(place)),
             problems: annotations.into_problems(),
             ..Frame::empty(agent.clone(), tick.capture_nanos, self.handedness)

@@ -5,10 +5,10 @@
 
 use std::path::PathBuf;
 
-use protocol::{CavId, Handedness, Pose};
+use protocol::{CavId, EgoMotion, Handedness, Pose};
 
 use super::agent_folders::ScenarioFolder;
-use super::annotations::{Annotations, speed_mps};
+use super::annotations::Annotations;
 use super::points::Sweeps;
 use super::written_pose::{WrittenPose, rigid};
 use super::yaml::{self, Field};
@@ -58,11 +58,13 @@ impl V2v4Real {
                 pose.validate().map(|()| pose)
             },
         );
+        let EgoMotion { speed_mps, yaw_rate_rad_s } = annotations.motion(Handedness::Right);
         Ok(Frame {
             world_from_lidar: Some(world_from_lidar),
             world_from_vehicle: annotations.optional(&["true_ego_pos", "true_ego_pose"], pose),
             gnss_world_from_vehicle: annotations.optional(&["predicted_ego_pos", "predicted_ego_pose"], pose),
-            speed_mps: annotations.optional(&["ego_speed"], speed_mps),
+            speed_mps,
+            yaw_rate_rad_s,
             objects,
             problems: annotations.into_problems(),
             ..Frame::empty(agent.clone(), tick.capture_nanos, Handedness::Right)

@@ -235,6 +235,24 @@ impl PoseSourceConfig {
         }
     }
 
+    /// The same with every sweep measured, to time a few of them.
+    #[must_use]
+    pub fn measuring_every_sweep(self) -> Self {
+        match self {
+            Self::Tracked(config) => Self::Tracked(TrackedPoseConfig { measure_every: 1, ..config }),
+            other => other,
+        }
+    }
+
+    /// Sweeps from one that is measured after its pose was published to the next, for a vehicle with this motion.
+    #[must_use]
+    pub fn measuring_interval(&self, motion: &EgoMotion) -> u32 {
+        match self {
+            Self::Tracked(config) => config.interval(motion),
+            _ => 1,
+        }
+    }
+
     /// Checks the values; files are not opened.
     ///
     /// # Errors

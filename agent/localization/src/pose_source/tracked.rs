@@ -7,7 +7,7 @@ use std::path::PathBuf;
 
 use perception::inference::Inference;
 use protocol::config::{FieldError, within};
-use protocol::{NoPoseReason, PlanarCovariance, PoseEstimate, StageTiming};
+use protocol::{EgoMotion, NoPoseReason, PlanarCovariance, PoseEstimate, StageTiming};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -27,7 +27,8 @@ pub struct TrackedPoseConfig {
     #[arg(skip)]
     #[serde(default)]
     pub head: PathBuf,
-    /// Sweeps from one measurement to the next, 1 to 100 (pose source tracked).
+    /// Sweeps from one measurement to the next, 1 to 100, of a vehicle that measures its yaw rate; of one without, half
+    /// as many (pose source tracked).
     #[arg(id = "tracking_measure_every", long = "measure-every", value_name = "SWEEPS")]
     #[serde(default = "TrackedPoseConfig::measure_every")]
     pub measure_every: u32,
@@ -47,7 +48,7 @@ pub struct TrackedPoseConfig {
 }
 
 impl Default for TrackedPoseConfig {
-    /// A measurement in every second sweep, one of the whole localizer every two seconds.
+    /// A measurement in every fourth sweep (every second without yaw rate), one of the whole localizer every two seconds.
     fn default() -> Self {
         Self {
             encoder: PathBuf::new(),
@@ -62,7 +63,7 @@ impl Default for TrackedPoseConfig {
 
 impl TrackedPoseConfig {
     fn measure_every() -> u32 {
-        2
+        4
     }
 
     fn global_period_s() -> f64 {
@@ -71,6 +72,12 @@ impl TrackedPoseConfig {
 
     fn max_coast_s() -> f64 {
         3.0
+    }
+
+    /// Sweeps from one measurement to the next of a vehicle with this motion: without yaw rate the prediction lags in
+    /// turns.
+    pub(super) fn interval(&self, motion: &EgoMotion) -> u32 {
+        if motion.yaw_rate_rad_s.is_some() { self.measure_every } else { self.measure_every.div_ceil(2) }
     }
 
     /// Checks the values; files are not opened.
@@ -174,10 +181,10 @@ impl TrackedPose {
     }
 
     /// True if the sweep is one of those that are measured.
-    fn is_due(&self) -> bool {
-        let turn = self.sweeps + u64::from(self.config.measure_every) - 1;
-        let phase = u64::from(self.config.phase);
-        self.tracker.needs_measurement() || (turn + phase).is_multiple_of(u64::from(self.config.measure_every))
+    fn is_due(&self, motion: &EgoMotion) -> bool {
+        let interval = u64::from(self.config.interval(motion));
+        let turn = self.sweeps + interval - 1 + u64::from(self.config.phase);
+        self.tracker.needs_measurement() || turn.is_multiple_of(interval)
     }
 
     /// True if the sweep is measured without the prediction.
@@ -201,7 +208,9 @@ impl PoseSource for TrackedPose {
 
     fn observe(&mut self, input: &PoseInput<'_>) -> bool {
         let is_measured = self.measured_nanos == Some(input.capture_nanos);
-        let Some(state) = self.tracker.state().filter(|_| !is_measured && self.is_due()) else { return false };
+        let Some(state) = self.tracker.state().filter(|_| !is_measured && self.is_due(&input.motion)) else {
+            return false;
+        };
         let predicted = (!self.is_global_due(input.capture_nanos)).then_some(&state);
         if let Some(localization) = self.measure(input, predicted) {
             self.correct(input.capture_nanos, &localization);
@@ -273,21 +282,29 @@ mod tests {
         }
     }
 
-    /// Poses of sweeps, and the numbers of measurements by the whole localizer and near the prediction.
+    /// Poses of sweeps, and the numbers of measurements by the whole localizer and near the prediction, without a yaw rate.
     fn drive(road: Road, config: TrackedPoseConfig, sweeps: usize) -> (Vec<PoseEstimate>, [u64; 2]) {
         let (globals, nears) = (Arc::clone(&road.globals), Arc::clone(&road.nears));
+        let steps = steps(road, config, None).take(sweeps);
+        let estimates = steps.map(|(estimate, _)| estimate).collect();
+        (estimates, [globals.load(Ordering::Relaxed), nears.load(Ordering::Relaxed)])
+    }
+
+    /// Each sweep's pose, and whether the sweep was measured afterwards.
+    fn steps(
+        road: Road,
+        config: TrackedPoseConfig,
+        yaw_rate_rad_s: Option<f64>,
+    ) -> impl Iterator<Item = (PoseEstimate, bool)> {
         let mut source = TrackedPose::new(Box::new(road), config);
         let cav = CavId::new("7").unwrap();
-        let estimates = (0..sweeps).map(|sweep| {
+        (0usize..).map(move |sweep| {
             let cloud = PointCloud { xyzi: vec![[0.0; 4]; sweep] };
             let capture_nanos = sweep as u64 * 100_000_000;
-            let motion = EgoMotion { speed_mps: Some(10.0), yaw_rate_rad_s: None };
+            let motion = EgoMotion { speed_mps: Some(10.0), yaw_rate_rad_s };
             let input = PoseInput { cav: &cav, capture_nanos, cloud: &cloud, measured: None, motion };
-            let estimate = source.estimate(&input);
-            source.observe(&input);
-            estimate
-        });
-        (estimates.collect(), [globals.load(Ordering::Relaxed), nears.load(Ordering::Relaxed)])
+            (source.estimate(&input), source.observe(&input))
+        })
     }
 
     fn road() -> Road {
@@ -300,7 +317,7 @@ mod tests {
     }
 
     #[test]
-    fn every_second_sweep_is_measured_and_each_has_a_pose() {
+    fn without_a_yaw_rate_every_second_sweep_is_measured_and_each_has_a_pose() {
         let (estimates, [globals, nears]) = drive(road(), TrackedPoseConfig::default(), 41);
         for (sweep, estimate) in estimates.iter().enumerate() {
             let [x, y] = x_y(estimate);
@@ -315,6 +332,24 @@ mod tests {
     fn vehicles_of_other_phases_measure_other_sweeps() {
         let (_, [globals, nears]) = drive(road(), TrackedPoseConfig { phase: 1, ..Default::default() }, 41);
         assert_eq!(globals + nears, 21, "the first sweep, and then those of odd numbers");
+    }
+
+    #[test]
+    fn with_a_yaw_rate_every_fourth_sweep_is_measured_and_vehicles_take_turns() {
+        let measured = |phase: u32| {
+            let steps = steps(road(), TrackedPoseConfig { phase, ..Default::default() }, Some(0.0));
+            let measured = steps.take(44).enumerate().skip(4).filter(|(_, (_, is_measured))| *is_measured);
+            measured.map(|(sweep, _)| sweep).collect::<Vec<_>>()
+        };
+        for (phase, turn) in (0u32..8).zip(0usize..) {
+            let expected: Vec<usize> = (4..44).filter(|sweep| (sweep + turn).is_multiple_of(4)).collect();
+            assert_eq!(measured(phase), expected, "phase {phase}");
+        }
+        let estimates: Vec<_> = steps(road(), TrackedPoseConfig::default(), Some(0.0)).take(44).collect();
+        // One pose of this localizer says little of the heading.
+        for (sweep, (estimate, _)) in estimates.iter().enumerate().skip(5) {
+            assert!((x_y(estimate)[0] - sweep as f64).abs() < 0.2 && estimate.confidence() > 0.9, "sweep {sweep}");
+        }
     }
 
     #[test]

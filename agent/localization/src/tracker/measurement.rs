@@ -4,12 +4,15 @@ use nalgebra::Isometry3;
 
 use crate::pgc::pose_solver::FoundPose;
 
+/// Factor on the standard deviation of the position that a sigma stands for: sigma was fitted to sweeps of all kinds,
+/// and those near a prediction are better.
+const POSITION_FACTOR: f64 = 0.65;
 /// Smallest standard deviation of a measured position per axis, metres: errors of one place repeat from sweep to sweep.
-const LEAST_POSITION_STD_M: f64 = 0.03;
+const LEAST_POSITION_STD_M: f64 = 0.02;
 /// Standard deviations of a measured yaw: smallest and largest, radians.
 const YAW_STD_RAD: [f64; 2] = [0.001, 0.2];
 /// Factor on the standard deviation of the orientation: errors of neighbouring cells are correlated.
-const ROTATION_FACTOR: f64 = 4.0;
+const ROTATION_FACTOR: f64 = 2.0;
 
 /// Pose of one sweep as a measurement.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -34,7 +37,7 @@ impl PoseMeasurement {
         Self {
             capture_nanos,
             world_from_lidar: found.world_from_sensor,
-            position_std_m: (error_m / std::f64::consts::SQRT_2).max(LEAST_POSITION_STD_M),
+            position_std_m: (POSITION_FACTOR * error_m / std::f64::consts::SQRT_2).max(LEAST_POSITION_STD_M),
             yaw_std_rad: (ROTATION_FACTOR * found.evidence.rotation_std_rad).clamp(least, most),
         }
     }

@@ -84,8 +84,10 @@ impl PoseTracker {
             self.rejected.clear();
         }
         let filter = self.filter.as_mut()?;
-        filter.advance(capture_nanos);
-        filter.correct_motion(motion);
+        filter.advance(capture_nanos, motion.yaw_rate_rad_s);
+        if let Some(speed_mps) = motion.speed_mps {
+            filter.correct_speed(speed_mps);
+        }
         if filter.planar_covariance().worst_variance_m2() > self.limits.max_position_std_m.powi(2) {
             self.filter = None;
         }

@@ -1,29 +1,40 @@
 //! Motion filter: extended Kalman filter of a vehicle that turns at a constant rate (CTRV), and of its height.
+//!
+//! Two constants of the vehicle are states too: the bias of its gyroscope, and the place of the LiDAR ahead of the point
+//! that moves straight along the heading (the middle of the rear axle), which swings the LiDAR sideways in a turn.
 
 use std::f64::consts::{PI, TAU};
 
-use nalgebra::{Isometry3, Matrix2, Matrix5, RowVector2, RowVector5, SMatrix, Translation3, UnitQuaternion, Vector2};
-use nalgebra::{Vector3, Vector5};
-use protocol::{EgoMotion, PlanarCovariance};
+use nalgebra::Vector3;
+use nalgebra::{Isometry3, Matrix2, RowSVector, RowVector2, SMatrix, SVector, Translation3, UnitQuaternion, Vector2};
+use protocol::PlanarCovariance;
 
 use super::measurement::PoseMeasurement;
 
 /// Standard deviation of the acceleration, metres per second squared.
 const ACCELERATION_STD: f64 = 2.0;
-/// Standard deviation of the yaw acceleration, radians per second squared.
+/// Standard deviation of the yaw acceleration where the yaw rate is not measured, radians per second squared.
 const YAW_ACCELERATION_STD: f64 = 0.8;
+/// The same where it is: what a mean rate does not show, or one that is of the end of the interval alone.
+const RESIDUAL_YAW_ACCELERATION_STD: f64 = 0.25;
 /// Standard deviation of the side slip after one second, metres.
-const SLIP_STD_M: f64 = 0.1;
-/// Standard deviation of the vertical acceleration, metres per second squared.
-const VERTICAL_ACCELERATION_STD: f64 = 0.5;
-/// Standard deviation of a measured speed, metres per second.
-const SPEED_STD_MPS: f64 = 0.05;
-/// Standard deviation of a measured yaw rate, radians per second.
-const YAW_RATE_STD: f64 = 0.005;
+const SLIP_STD_M: f64 = 0.05;
+/// Standard deviation of the vertical acceleration beside that of the slope, metres per second squared.
+const VERTICAL_ACCELERATION_STD: f64 = 0.1;
+/// Standard deviation of a measured speed, metres per second: OpenCDA's 0.2 and the error of a wheel's radius.
+const SPEED_STD_MPS: f64 = 0.25;
+/// Standard deviation of a measured yaw rate without its bias, radians per second: 0.1 degrees/s, as of a MEMS gyroscope.
+const YAW_RATE_STD: f64 = 0.002;
+/// Standard deviation of the gyroscope's unknown bias, radians per second: 0.6 degrees/s, not calibrated.
+const BIAS_STD: f64 = 0.01;
+/// Standard deviation of the change of that bias after one second, radians per second.
+const BIAS_DRIFT_STD: f64 = 0.0002;
+/// Standard deviation of the LiDAR's unknown place ahead of the rear axle, metres.
+const LEVER_STD_M: f64 = 1.5;
 /// Standard deviation of the unknown speed and yaw rate at the first pose, metres and radians per second.
 const FIRST_STD: [f64; 2] = [15.0, 0.3];
-/// Weight of a measurement's roll and pitch.
-const TILT_WEIGHT: f64 = 0.3;
+/// Time after which roll and pitch are those of later measurements by 63 %, seconds.
+const TILT_TIME_S: f64 = 0.56;
 
 // Places in the state.
 const X: usize = 0;
@@ -31,20 +42,29 @@ const Y: usize = 1;
 const YAW: usize = 2;
 const SPEED: usize = 3;
 const YAW_RATE: usize = 4;
+const BIAS: usize = 5;
+const LEVER: usize = 6;
+const STATES: usize = 7;
+
+type State = SVector<f64, STATES>;
+type Covariance = SMatrix<f64, STATES, STATES>;
 
 /// State of a vehicle at one time, with its covariance.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct MotionFilter {
     /// Capture time of the state, nanoseconds.
     pub(super) capture_nanos: u64,
-    /// x, y (metres, world), yaw (radians), speed along the heading (m/s), yaw rate (rad/s).
-    state: Vector5<f64>,
-    covariance: Matrix5<f64>,
-    /// Height (metres, world) and vertical speed (m/s).
+    /// x, y (metres, world) and yaw (radians) of the LiDAR, speed along the heading (m/s), yaw rate (rad/s), bias of the
+    /// gyroscope (rad/s), and the LiDAR's place ahead of the rear axle (metres).
+    state: State,
+    covariance: Covariance,
+    /// Height (metres, world) and vertical speed beside that of the slope (m/s).
     height: Vector2<f64>,
     height_covariance: Matrix2<f64>,
     roll_rad: f64,
     pitch_rad: f64,
+    /// Capture time of the last measurement, nanoseconds.
+    measured_nanos: u64,
 }
 
 impl MotionFilter {
@@ -52,67 +72,93 @@ impl MotionFilter {
     pub(super) fn at(measurement: &PoseMeasurement) -> Self {
         let [x, y, z] = measurement.world_from_lidar.translation.vector.data.0[0];
         let (roll_rad, pitch_rad, yaw) = measurement.world_from_lidar.rotation.euler_angles();
-        let position = measurement.position_std_m.powi(2);
-        let [speed, yaw_rate] = FIRST_STD.map(|std| std * std);
-        let diagonal = Vector5::new(position, position, measurement.yaw_std_rad.powi(2), speed, yaw_rate);
+        let (position, [speed, yaw_rate]) = (measurement.position_std_m, FIRST_STD);
+        let std = State::from([position, position, measurement.yaw_std_rad, speed, yaw_rate, BIAS_STD, LEVER_STD_M]);
         Self {
             capture_nanos: measurement.capture_nanos,
-            state: Vector5::new(x, y, yaw, 0.0, 0.0),
-            covariance: Matrix5::from_diagonal(&diagonal),
+            state: State::from([x, y, yaw, 0.0, 0.0, 0.0, 0.0]),
+            covariance: Covariance::from_diagonal(&std.component_mul(&std)),
             height: Vector2::new(z, 0.0),
-            height_covariance: Matrix2::new(position, 0.0, 0.0, 1.0),
+            height_covariance: Matrix2::new(position * position, 0.0, 0.0, 1.0),
             roll_rad,
             pitch_rad,
+            measured_nanos: measurement.capture_nanos,
         }
     }
 
-    /// Moves the state to a later capture time.
-    pub(super) fn advance(&mut self, capture_nanos: u64) {
+    /// Moves the state to a later capture time, at the yaw rate that the gyroscope measured until then, if there is one.
+    pub(super) fn advance(&mut self, capture_nanos: u64, measured_yaw_rate_rad_s: Option<f64>) {
         let time_s = capture_nanos.saturating_sub(self.capture_nanos) as f64 * 1e-9;
         self.capture_nanos = capture_nanos;
-        let [.., speed, yaw_rate] = self.state.data.0[0];
-        // Midpoint rule: the heading half way.
-        let (sin, cos) = (self.state[YAW] + yaw_rate * time_s / 2.0).sin_cos();
-        let distance_m = speed * time_s;
-        self.state[X] += distance_m * cos;
-        self.state[Y] += distance_m * sin;
-        self.state[YAW] = wrapped_rad(self.state[YAW] + yaw_rate * time_s);
+        let measured = measured_yaw_rate_rad_s.filter(|rate| rate.is_finite());
+        if let Some(rate) = measured {
+            self.set_yaw_rate(rate);
+        }
+        let is_measured = measured.is_some();
+        self.advance_plane(time_s, if is_measured { RESIDUAL_YAW_ACCELERATION_STD } else { YAW_ACCELERATION_STD });
+        self.advance_height(time_s);
+    }
 
-        let mut step = Matrix5::identity();
-        step[(X, YAW)] = -distance_m * sin;
-        step[(Y, YAW)] = distance_m * cos;
+    fn advance_plane(&mut self, time_s: f64, yaw_acceleration_std: f64) {
+        let [_, _, yaw, speed, yaw_rate, _, lever_m] = self.state.data.0[0];
+        // Midpoint rule: the heading half way.
+        let (sin, cos) = (yaw + yaw_rate * time_s / 2.0).sin_cos();
+        let (ahead_m, aside_m) = (speed * time_s, lever_m * yaw_rate * time_s);
+        let [moved_x, moved_y] = [ahead_m * cos - aside_m * sin, ahead_m * sin + aside_m * cos];
+        self.state[X] += moved_x;
+        self.state[Y] += moved_y;
+        self.state[YAW] = wrapped_rad(yaw + yaw_rate * time_s);
+
+        let mut step = Covariance::identity();
+        step[(X, YAW)] = -moved_y;
+        step[(Y, YAW)] = moved_x;
         step[(X, SPEED)] = time_s * cos;
         step[(Y, SPEED)] = time_s * sin;
-        step[(X, YAW_RATE)] = -distance_m * sin * time_s / 2.0;
-        step[(Y, YAW_RATE)] = distance_m * cos * time_s / 2.0;
+        step[(X, YAW_RATE)] = (-moved_y / 2.0 - lever_m * sin) * time_s;
+        step[(Y, YAW_RATE)] = (moved_x / 2.0 + lever_m * cos) * time_s;
+        step[(X, LEVER)] = -sin * yaw_rate * time_s;
+        step[(Y, LEVER)] = cos * yaw_rate * time_s;
         step[(YAW, YAW_RATE)] = time_s;
         let half_square = time_s * time_s / 2.0;
-        let pushed = Vector5::new(half_square * cos, half_square * sin, 0.0, time_s, 0.0) * ACCELERATION_STD;
-        let turned = Vector5::new(0.0, 0.0, half_square, 0.0, time_s) * YAW_ACCELERATION_STD;
-        let slipped = Vector5::new(-sin, cos, 0.0, 0.0, 0.0) * SLIP_STD_M * time_s.sqrt();
+        let pushed = State::from([half_square * cos, half_square * sin, 0.0, time_s, 0.0, 0.0, 0.0]) * ACCELERATION_STD;
+        let turned = State::from([0.0, 0.0, half_square, 0.0, time_s, 0.0, 0.0]) * yaw_acceleration_std;
+        let slipped = State::from([-sin, cos, 0.0, 0.0, 0.0, 0.0, 0.0]) * SLIP_STD_M * time_s.sqrt();
         self.covariance = step * self.covariance * step.transpose()
             + pushed * pushed.transpose()
             + turned * turned.transpose()
             + slipped * slipped.transpose();
+        self.covariance[(BIAS, BIAS)] += BIAS_DRIFT_STD * BIAS_DRIFT_STD * time_s;
+    }
 
+    fn advance_height(&mut self, time_s: f64) {
         let step = Matrix2::new(1.0, time_s, 0.0, 1.0);
-        let lifted = Vector2::new(half_square, time_s) * VERTICAL_ACCELERATION_STD;
-        self.height = step * self.height;
+        let lifted = Vector2::new(time_s * time_s / 2.0, time_s) * VERTICAL_ACCELERATION_STD;
+        // Nose down is a positive pitch.
+        let climbed_m = -self.state[SPEED] * self.pitch_rad.sin() * time_s;
+        self.height = step * self.height + Vector2::new(climbed_m, 0.0);
         self.height_covariance = step * self.height_covariance * step.transpose() + lifted * lifted.transpose();
     }
 
-    /// Uses speed and yaw rate that the vehicle measured at the time of the state.
-    pub(super) fn correct_motion(&mut self, motion: &EgoMotion) {
-        let measured = [(SPEED, motion.speed_mps, SPEED_STD_MPS), (YAW_RATE, motion.yaw_rate_rad_s, YAW_RATE_STD)];
-        for (place, value, std) in measured {
-            let Some(value) = value.filter(|value| value.is_finite()) else { continue };
-            let mut selects = RowVector5::zeros();
-            selects[place] = 1.0;
-            let variance = self.covariance[(place, place)] + std * std;
-            let gain = self.covariance.column(place) / variance;
-            let off = value - self.state[place];
-            self.move_by(&(gain * off), &(Matrix5::identity() - gain * selects));
+    /// Replaces the yaw rate by a measured one less the bias: their errors are the same, beside the noise.
+    fn set_yaw_rate(&mut self, measured_rad_s: f64) {
+        self.state[YAW_RATE] = measured_rad_s - self.state[BIAS];
+        let mut of_bias = -self.covariance.column(BIAS);
+        of_bias[YAW_RATE] = self.covariance[(BIAS, BIAS)] + YAW_RATE_STD * YAW_RATE_STD;
+        self.covariance.set_column(YAW_RATE, &of_bias);
+        self.covariance.set_row(YAW_RATE, &of_bias.transpose());
+    }
+
+    /// Uses the speed that the vehicle measured at the time of the state.
+    pub(super) fn correct_speed(&mut self, speed_mps: f64) {
+        if !speed_mps.is_finite() {
+            return;
         }
+        let mut selects = RowSVector::<f64, STATES>::zeros();
+        selects[SPEED] = 1.0;
+        let variance = self.covariance[(SPEED, SPEED)] + SPEED_STD_MPS * SPEED_STD_MPS;
+        let gain = self.covariance.column(SPEED) / variance;
+        let off = speed_mps - self.state[SPEED];
+        self.move_by(&(gain * off), &(Covariance::identity() - gain * selects));
     }
 
     /// Squared Mahalanobis distance between a pose of the same time and the state: x, y and yaw.
@@ -126,18 +172,26 @@ impl MotionFilter {
         let (off, spread) = self.innovation(measurement);
         let Some(inverse) = spread.try_inverse() else { return };
         let gain = self.covariance.fixed_columns::<3>(0) * inverse;
-        let mut selects = SMatrix::<f64, 3, 5>::zeros();
+        let mut selects = SMatrix::<f64, 3, STATES>::zeros();
         selects.fixed_view_mut::<3, 3>(0, 0).fill_with_identity();
-        self.move_by(&(gain * off), &(Matrix5::identity() - gain * selects));
+        self.move_by(&(gain * off), &(Covariance::identity() - gain * selects));
 
         let off_m = measurement.world_from_lidar.translation.z - self.height[0];
         let variance = self.height_covariance[(0, 0)] + measurement.position_std_m.powi(2);
         let gain = self.height_covariance.column(0) / variance;
         self.height += gain * off_m;
         self.height_covariance = (Matrix2::identity() - gain * RowVector2::new(1.0, 0.0)) * self.height_covariance;
+        self.correct_tilt(measurement);
+    }
+
+    /// Roll and pitch move towards the measured ones, the further the longer ago the last measurement was.
+    fn correct_tilt(&mut self, measurement: &PoseMeasurement) {
         let (roll_rad, pitch_rad, _) = measurement.world_from_lidar.rotation.euler_angles();
-        self.roll_rad += TILT_WEIGHT * wrapped_rad(roll_rad - self.roll_rad);
-        self.pitch_rad += TILT_WEIGHT * wrapped_rad(pitch_rad - self.pitch_rad);
+        let time_s = measurement.capture_nanos.saturating_sub(self.measured_nanos) as f64 * 1e-9;
+        let weight = 1.0 - (-time_s / TILT_TIME_S).exp();
+        self.roll_rad += weight * wrapped_rad(roll_rad - self.roll_rad);
+        self.pitch_rad += weight * wrapped_rad(pitch_rad - self.pitch_rad);
+        self.measured_nanos = measurement.capture_nanos;
     }
 
     /// Sets a speed that is known from elsewhere, metres per second.
@@ -178,7 +232,7 @@ impl MotionFilter {
     }
 
     /// Moves the state by `change` and keeps `remaining` of the covariance.
-    fn move_by(&mut self, change: &Vector5<f64>, remaining: &Matrix5<f64>) {
+    fn move_by(&mut self, change: &State, remaining: &Covariance) {
         self.state += change;
         self.state[YAW] = wrapped_rad(self.state[YAW]);
         let covariance = remaining * self.covariance;

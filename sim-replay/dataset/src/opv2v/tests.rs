@@ -198,6 +198,29 @@ fn other_fields_are_left_out_one_by_one() {
 }
 
 #[test]
+fn a_vehicle_measures_its_motion() {
+    let imu = "imu: {heading_deg: 90, speed_mps: 9.5, yaw_rate_degps: -18}\nlidar_pose:";
+    let frame = load_with("lidar_pose:", imu).unwrap();
+    assert_eq!(frame.speed_mps, Some(9.5), "a measurement rather than the ego_speed");
+    assert!((frame.yaw_rate_rad_s.unwrap() - 18f64.to_radians()).abs() < 1e-12, "to the right is negative");
+    for (field, value) in
+        [("yaw_rate_degps", ".nan"), ("yaw_rate_degps", "1200"), ("speed_mps", "-201"), ("speed_mps", "fast")]
+    {
+        let frame = load_with("lidar_pose:", &format!("imu: {{{field}: {value}}}\nlidar_pose:")).unwrap();
+        let message = &frame.problems[0].message;
+        let told = message.contains("000070.yaml:3: imu.") && message.ends_with("the field is left out");
+        assert!(told && message.to_lowercase().contains(value.trim_start_matches('.')), "{message}");
+        assert_eq!(frame.problems[0].field, Some(format!("imu.{field}")));
+        assert_eq!((frame.speed_mps, frame.yaw_rate_rad_s, frame.problems.len()), (Some(10.0), None, 1));
+    }
+    let frame = load_with("ego_speed: 36", "ego_speed: 800").unwrap();
+    assert_eq!((frame.speed_mps, frame.problems.len()), (None, 1), "222 m/s");
+    // Other sensors are other fields.
+    let frame = load_with("lidar_pose:", "imu: {gyroscope: [0, 0, 1]}\nlidar_pose:").unwrap();
+    assert_eq!((frame.yaw_rate_rad_s, frame.problems.len()), (None, 0));
+}
+
+#[test]
 fn types_are_read_by_whatever_key() {
     for key in ["obj_type", "object_type", "class", "type"] {
         let frame = load_with("speed: 18", &format!("speed: 18\n    {key}: Pedestrian")).unwrap();

@@ -168,8 +168,7 @@ impl Scene<'_, '_> {
             let id = recording.frames[0].of(vehicle).map_or(0, |moving| moving.id);
             let mut positioning = Positioning::new(derive_seed(self.spec.seed, &[4, id as u64]));
             let moving = recording.frames.iter().filter_map(|frame| frame.of(vehicle));
-            let fixes =
-                moving.map(|moving| positioning.fix(&moving.motion.end, moving.speed_mps, self.options.period_s));
+            let fixes = moving.map(|moving| positioning.fix(&moving.motion, moving.speed_mps, self.options.period_s));
             let cav = CavId::new(&id.to_string()).map_err(|error| SynthError::Layout {
                 layout: self.options.layout.name(),
                 reason: error.to_string(),

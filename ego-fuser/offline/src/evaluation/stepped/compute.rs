@@ -4,10 +4,11 @@ use std::time::{Duration, Instant};
 
 use dataset::{LoadOptions, Scenario};
 use ego_fuser::ego::View;
+use protocol::EgoMotion;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use support::nanos;
-use support::statistics::{mean, median};
+use support::statistics::median;
 
 use super::super::{EvaluateError, Evaluator, view};
 
@@ -73,6 +74,8 @@ struct Samples {
     observe: Vec<f64>,
     map: Vec<f64>,
     fuse: Vec<f64>,
+    /// Motion of a vehicle in the last sweep.
+    motion: EgoMotion,
 }
 
 impl Evaluator {
@@ -103,15 +106,19 @@ impl Evaluator {
     ) -> Result<ComputeTimes, EvaluateError> {
         let began = Instant::now();
         let goes_on = |ticks| ticks < ESTIMATED_TICKS || (ticks < MEASURED_TICKS && began.elapsed() < budget);
-        let samples = self.samples(scenario, vehicles, &goes_on)?;
+        // Few sweeps are timed, so each of them is measured.
+        let source = self.config.pose_source.clone();
+        self.config.pose_source = source.clone().measuring_every_sweep();
+        let samples = self.samples(scenario, vehicles, &goes_on);
+        self.config.pose_source = source;
+        let Samples { pose, observe, map, fuse, motion } = &samples?;
         let warm = |per_tick: usize, sample: &[f64]| {
             let warm = sample.get(per_tick..).filter(|warm| !warm.is_empty()).unwrap_or(sample);
             median(warm).unwrap_or(0.0)
         };
         let agents = vehicles.min(MEASURED_VEHICLES);
-        let Samples { pose, observe, map, fuse } = &samples;
-        // Not every sweep is measured after its pose was published.
-        let pose_ms = warm(agents, pose) + mean(observe).unwrap_or(0.0);
+        let interval = f64::from(self.config.pose_source.measuring_interval(motion));
+        let pose_ms = warm(agents, pose) + warm(agents, observe) / interval;
         Ok(ComputeTimes { pose_ms, map_ms: warm(agents, map), fuse_ms: warm(1, fuse) })
     }
 
@@ -129,7 +136,7 @@ impl Evaluator {
             .take(MEASURED_VEHICLES)
             .map(|cav| self.participant(scenario, cav, true, None))
             .collect::<Result<Vec<_>, EvaluateError>>()?;
-        let Samples { mut pose, mut observe, mut map, mut fuse } = Samples::default();
+        let Samples { mut pose, mut observe, mut map, mut fuse, mut motion } = Samples::default();
         self.ego.forget();
         for tick in (0..scenario.ticks.len()).take_while(|tick| goes_on(*tick)) {
             let mut sent = Vec::with_capacity(participants.len());
@@ -138,6 +145,7 @@ impl Evaluator {
                     continue;
                 }
                 let frame = scenario.load(place, tick, &LoadOptions::default())?;
+                motion = frame.motion();
                 let began = Instant::now();
                 sent.extend(view(participant, &frame, None, Some(exchange), &self.config.codec)?.into_view());
                 let all = began.elapsed();
@@ -158,7 +166,7 @@ impl Evaluator {
             fuse.push(ms(began.elapsed()));
         }
         self.ego.forget();
-        Ok(Samples { pose, observe, map, fuse })
+        Ok(Samples { pose, observe, map, fuse, motion })
     }
 }
 

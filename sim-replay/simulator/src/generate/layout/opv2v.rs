@@ -5,7 +5,7 @@
 use std::fmt::Write as _;
 use std::path::Path;
 
-use protocol::{PointCloud, Pose};
+use protocol::{EgoMotion, PointCloud, Pose};
 
 use super::agent_folders::{AgentFolderWriter, AgentFolders};
 use super::disk::write_file;
@@ -56,8 +56,9 @@ fn write_frame(yaml: &mut String, agent: &AgentFrame, is_roadside: bool) -> std:
     if let Some(speed_mps) = frame.speed_mps {
         writeln!(yaml, "ego_speed: {}", KMH_PER_MPS * speed_mps)?;
     }
-    if let Some(simulated) = &agent.simulated {
-        write_receivers(yaml, &simulated.fix)?;
+    match &agent.simulated {
+        Some(simulated) => write_receivers(yaml, &simulated.fix)?,
+        None => write_motion(yaml, &frame.motion())?,
     }
     let poses = [
         ("lidar_pose", frame.world_from_lidar),
@@ -79,6 +80,12 @@ fn write_receivers(yaml: &mut String, fix: &Fix) -> std::fmt::Result {
     // Left-handed like everything in these files.
     let (heading, rate) = (-fix.heading_rad.to_degrees(), -fix.yaw_rate_radps.to_degrees());
     writeln!(yaml, "imu:\n  heading_deg: {heading}\n  speed_mps: {}\n  yaw_rate_degps: {rate}", fix.speed_mps)
+}
+
+/// The motion of a recorded frame, if its yaw rate is recorded: `ego_speed` alone holds the speed.
+fn write_motion(yaml: &mut String, motion: &EgoMotion) -> std::fmt::Result {
+    let Some(yaw_rate_rad_s) = motion.yaw_rate_rad_s else { return Ok(()) };
+    writeln!(yaml, "imu:\n  yaw_rate_degps: {}", -yaw_rate_rad_s.to_degrees())
 }
 
 fn write_vehicles(yaml: &mut String, agent: &AgentFrame) -> std::fmt::Result {
