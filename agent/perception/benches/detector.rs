@@ -8,6 +8,7 @@ use std::time::Duration;
 
 use criterion::{Criterion, criterion_group, criterion_main};
 use perception::detector::Detector;
+use perception::int8::ScaleSearch;
 use perception::model_config::DetectorConfig;
 use perception::pillars::point_pillars::PointPillars;
 use perception::pillars::voxels::Voxeliser;
@@ -48,14 +49,23 @@ fn voxelise(criterion: &mut Criterion) {
 fn encode(criterion: &mut Criterion) {
     let mut group = criterion.benchmark_group("encode");
     group.sample_size(10);
-    for (config, threads) in [(DetectorConfig::lean(), 1), (DetectorConfig::full(), 1), (DetectorConfig::full(), 2)] {
+    let [lean, full] = [DetectorConfig::lean, DetectorConfig::full];
+    for (config, threads, is_int8) in
+        [(lean(), 1, false), (lean(), 1, true), (full(), 1, false), (full(), 1, true), (full(), 2, false)]
+    {
         tch::set_num_threads(threads);
         let network = VarStore::new(Device::Cpu);
         let pillars = PointPillars::new(&network.root(), &config).expect("a preset is valid");
         let mut detector = Detector::from_network(pillars);
         let cloud = PointCloud { xyzi: sweep(60_000, 100.0) };
+        if is_int8 {
+            let mut search = ScaleSearch::default();
+            detector.observe(&cloud, &mut search).expect("a sweep is observed");
+            detector = detector.quantised(&search.scales()).expect("a preset can be quantised");
+        }
+        let name = format!("{}{}", config.name, if is_int8 { "-int8" } else { "" });
         let mut stages = Vec::new();
-        group.bench_function(format!("{}/{threads}-thread/60000", config.name), |bencher| {
+        group.bench_function(format!("{name}/{threads}-thread/60000"), |bencher| {
             bencher.iter(|| stages.push(detector.encode(black_box(&cloud)).expect("a sweep is encoded").times));
         });
         let median = |place: usize| {
@@ -63,10 +73,7 @@ fn encode(criterion: &mut Criterion) {
             Duration::from_secs_f64(statistics::median(&nanos).unwrap_or(0.0) * 1e-9)
         };
         let stage = [0, 1, 2].map(median);
-        println!(
-            "{} stages: voxelise {:.2?}, pillars {:.2?}, backbone {:.2?}",
-            config.name, stage[0], stage[1], stage[2]
-        );
+        println!("{name} stages: voxelise {:.2?}, pillars {:.2?}, backbone {:.2?}", stage[0], stage[1], stage[2]);
     }
     group.finish();
 }

@@ -22,7 +22,7 @@ use output::flat;
 use crate::boxes::anchors::Anchors;
 use crate::boxes::decode::{Decoded, decode};
 use crate::crop::Crop;
-use crate::int8::ScaleSearch;
+use crate::int8::{ActivationScales, QuantiseError, ScaleSearch};
 use crate::layers::head::DetectionHead;
 use crate::layers::shrink::{Compressor, Shrink};
 use crate::model_config::{DetectorConfig, YAxis};
@@ -67,11 +67,19 @@ impl Detector {
         let network = VarStore::new(Device::Cpu);
         let pillars = PointPillars::new(&network.root(), config)?;
         weights.copy_into(&network)?;
-        let mut detector = Self { sha256: weights.sha256().to_owned(), ..Self::from_network(pillars) };
-        if let Some(scales) = weights.activation_scales()? {
-            detector.encoder = detector.encoder.quantised(&scales).map_err(|error| weights.quantise_error(error))?;
+        let detector = Self { sha256: weights.sha256().to_owned(), ..Self::from_network(pillars) };
+        match weights.activation_scales()? {
+            Some(scales) => Ok(detector.quantised(&scales).map_err(|error| weights.quantise_error(error))?),
+            None => Ok(detector),
         }
-        Ok(detector)
+    }
+
+    /// The same in 8-bit integers; its feature maps are in floating point.
+    ///
+    /// # Errors
+    /// [`QuantiseError`] names the activation whose scale is missing.
+    pub fn quantised(self, scales: &ActivationScales) -> Result<Self, QuantiseError> {
+        Ok(Self { encoder: self.encoder.quantised(scales)?, ..self })
     }
 
     /// Uses a network on the CPU, trained or not; its norms are folded into the convolutions.
