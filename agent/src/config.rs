@@ -9,11 +9,13 @@ use protocol::config::{FieldError, within};
 use protocol::{CavId, CodecConfig, RunId, Stream};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use tch::Device;
 
 use crate::attack::Falsification;
 use crate::node::NodeOptions;
 use crate::rate::RateConfig;
 use localization::pose_source::PoseSourceConfig;
+use perception::compute_device::ComputeDevice;
 
 /// Configuration of `agent run`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema, clap::Args)]
@@ -37,7 +39,7 @@ pub struct AgentConfig {
     #[arg(long, value_name = "FILE")]
     #[serde(default)]
     pub sweep_log: Option<PathBuf>,
-    /// Detector and threads.
+    /// Detector, threads and device.
     #[command(flatten)]
     pub models: ModelConfig,
     /// Pose, codec and rate control.
@@ -50,7 +52,7 @@ pub struct AgentConfig {
     pub bus: BusConfig,
 }
 
-/// Detector of a process and its number of threads.
+/// Detector of a process, and where and with how many threads it computes.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema, clap::Args)]
 #[serde(deny_unknown_fields)]
 pub struct ModelConfig {
@@ -61,6 +63,30 @@ pub struct ModelConfig {
     #[arg(long)]
     #[serde(default)]
     pub threads: Threads,
+    /// Device that the networks compute on; cuda needs a libtorch with CUDA and a CUDA device, and its results are
+    /// slightly different.
+    #[arg(long, value_enum)]
+    #[serde(default)]
+    pub device: ComputeDevice,
+}
+
+impl ModelConfig {
+    /// Checks that the processes can compute as configured.
+    ///
+    /// # Errors
+    /// [`FieldError`] for a number of threads out of range, or a device that is missing.
+    pub fn validate(&self) -> Result<(), FieldError> {
+        self.threads.validate()?;
+        self.device().map(drop)
+    }
+
+    /// Device of the tensor library.
+    ///
+    /// # Errors
+    /// [`FieldError`] names what a device needs and this machine lacks.
+    pub fn device(&self) -> Result<Device, FieldError> {
+        self.device.open().map_err(|missing| FieldError::new("models.device", "cuda", missing.to_string()))
+    }
 }
 
 /// Settings of a vehicle's agent: the same in a scenario, for all vehicles or for one.
@@ -159,7 +185,7 @@ impl ProcessConfig for AgentConfig {
     const REQUIRED: &'static [&'static str] = &["run", "cav", "models.weights"];
 
     fn validate(&self) -> Result<(), FieldError> {
-        self.models.threads.validate()?;
+        self.models.validate()?;
         self.settings.validate()?;
         self.bus.validate()
     }

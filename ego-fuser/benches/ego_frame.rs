@@ -25,6 +25,7 @@ use protocol::{CodecConfig, EncodedFeatures, Limits, Pose, PoseEstimate};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use support::stage_times::StageTimes;
+use tch::Device;
 
 /// Largest error of a pose along x and y, metres.
 const POSE_ERROR_M: f64 = 0.2;
@@ -83,7 +84,7 @@ fn main() -> Result<(), Failure> {
             let frames = sent(&scenario, &weights, method, [vehicles, arguments.frames])?;
             let mut best: Vec<BTreeMap<String, f64>> = vec![BTreeMap::new(); frames.len()];
             for run in 0..arguments.runs {
-                let mut ego = Ego::load(&weights, Some(method))?;
+                let mut ego = Ego::load(&weights, Some(method), Device::Cpu)?;
                 for (index, (frame, best)) in frames.iter().zip(&mut best).enumerate() {
                     let found = timed(&mut ego, frame, best)?;
                     if run + 1 == arguments.runs {
@@ -146,8 +147,8 @@ fn sent(
     let mut random = ChaCha8Rng::seed_from_u64(vehicles as u64);
     let mut agents = Vec::new();
     for cav in scenario.agents.iter().take(vehicles) {
-        let source = PoseSourceConfig::Recorded.for_scenario(&scenario.name).build()?;
-        agents.push(Agent::new(cav.clone(), source, Detector::load(weights)?));
+        let source = PoseSourceConfig::Recorded.for_scenario(&scenario.name).build(Device::Cpu)?;
+        agents.push(Agent::new(cav.clone(), source, Detector::load(weights, Device::Cpu)?));
     }
     let mut all = Vec::with_capacity(frames);
     for tick in 0..frames {

@@ -4,6 +4,7 @@
 //! - [`boxes`]: anchors, decoding, non-maximum suppression and post-processing.
 //! - [`sparse`]: sparse convolution, for the scene encoder of the localization.
 //! - [`weights`], [`model_config`]: checkpoints and the sizes of a model.
+//! - [`compute_device`]: where networks compute.
 //! - [`train`]: optimiser, schedule, checkpoints and progress of every training.
 //!
 //! Tensors are `[N, C, H, W]`; the row of a BEV feature map grows with y, the column with x.
@@ -11,6 +12,7 @@
 #![warn(clippy::print_stdout, clippy::print_stderr)]
 
 pub mod boxes;
+pub mod compute_device;
 pub mod crop;
 pub mod detector;
 pub mod layers;

@@ -50,8 +50,9 @@ pub(crate) fn run(args: Args) -> anyhow::Result<()> {
 }
 
 fn agent(config: &AgentConfig) -> anyhow::Result<Agent> {
-    let detector = Detector::load(&config.models.weights).context("weights")?;
-    Ok(Agent::new(config.cav.clone(), config.settings.pose.build()?, detector))
+    let device = config.models.device()?;
+    let detector = Detector::load(&config.models.weights, device).context("weights")?;
+    Ok(Agent::new(config.cav.clone(), config.settings.pose.build(device)?, detector))
 }
 
 fn output_filter(config: &AgentConfig) -> Box<dyn OutputFilter> {

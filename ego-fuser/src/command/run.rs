@@ -28,7 +28,9 @@ impl Arguments {
         let EgoConfig { run, models, method, ego: settings, bus, .. } = &config;
         let cav = settings.id.as_ref().context("the configuration names no ego")?;
         models.threads.apply();
-        let ego = Ego::load(&models.weights, *method).map_err(|error| BadInput::new(format!("weights: {error}")))?;
+        let device = models.device().map_err(BadInput::of)?;
+        let ego = Ego::load(&models.weights, *method, device);
+        let ego = ego.map_err(|error| BadInput::new(format!("weights: {error}")))?;
         let ego = ego.with_comm_range(config.comm_range_m).with_misbehaviour_detection(settings.trust())?;
         let stop = bus.stop().context("installing signal handlers")?;
         let bus = bus.join(run, Role::Ego, cav)?;

@@ -17,6 +17,7 @@ use fusion::pastat::{Part, ablated};
 use localization::pose_source::{CachedPoseConfig, NoiseMode, NoisyPoseConfig, PoseRow, PoseSourceConfig, PoseTable};
 use perception::weights::Weights;
 use protocol::{CodecConfig, Dtype, NoPoseReason, PoseEstimate};
+use tch::Device;
 use tests::locks::random_generator_lock;
 use tests::scene;
 use tests::training::{Ear, config, small};
@@ -227,7 +228,7 @@ fn poses_that_were_found_once_serve_training_and_evaluation() {
 
     fs::write(&file, "scenario,cav\n").unwrap();
     let source = PoseSourceConfig::Cached(CachedPoseConfig { file, scenario: None });
-    assert!(source.build().unwrap_err().to_string().contains("poses.csv:1"));
+    assert!(source.build(Device::Cpu).unwrap_err().to_string().contains("poses.csv:1"));
 }
 
 #[derive(Default)]

@@ -50,21 +50,21 @@ pub struct LocalizedPose {
 }
 
 impl LocalizedPose {
-    /// Reads the networks of PGC, to compute with on the CPU.
+    /// Reads the networks of PGC, to compute with on `device`.
     ///
     /// # Errors
     /// [`LocalizerError`] names the file and what is wrong with it.
-    pub fn pgc(config: &PgcConfig) -> Result<Self, LocalizerError> {
-        let localizer = Localizer::load(&config.encoder, &config.head, Device::Cpu)?;
+    pub fn pgc(config: &PgcConfig, device: Device) -> Result<Self, LocalizerError> {
+        let localizer = Localizer::load(&config.encoder, &config.head, device)?;
         Ok(Self::new(Box::new(localizer), config.motion_gate.clone()))
     }
 
-    /// Reads a network that was trained end to end, to compute with on the CPU.
+    /// Reads a network that was trained end to end, to compute with on `device`.
     ///
     /// # Errors
     /// [`LocalizerError`] names the file and what is wrong with it.
-    pub fn end_to_end(config: &EndToEndPoseConfig) -> Result<Self, LocalizerError> {
-        let localizer = EndToEndLocalizer::load(&config.weights, Device::Cpu)?;
+    pub fn end_to_end(config: &EndToEndPoseConfig, device: Device) -> Result<Self, LocalizerError> {
+        let localizer = EndToEndLocalizer::load(&config.weights, device)?;
         Ok(Self::new(Box::new(localizer), config.motion_gate.clone()))
     }
 

@@ -19,6 +19,7 @@ use protocol::config::{FieldError, within};
 use protocol::{CavId, EgoMotion, NoPoseReason, PointCloud, Pose, PoseEstimate, StageTiming};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use tch::Device;
 
 pub use error_table::{ErrorTable, ErrorTableError, TableRow};
 pub use localized::{EndToEndPoseConfig, LocalizedPose, PgcConfig};
@@ -295,18 +296,18 @@ impl PoseSourceConfig {
         matches!(self, Self::Pgc(_) | Self::Tracked(_) | Self::EndToEnd(_))
     }
 
-    /// Sets the source up and reads its files.
+    /// Sets the source up and reads its files; networks compute on `device`.
     ///
     /// # Errors
     /// [`PoseSourceError`] names the field or the file.
-    pub fn build(&self) -> Result<Box<dyn PoseSource>, PoseSourceError> {
+    pub fn build(&self, device: Device) -> Result<Box<dyn PoseSource>, PoseSourceError> {
         self.validate()?;
         Ok(match self {
             Self::Recorded => Box::new(RecordedPose),
             Self::Noisy(config) => Box::new(NoisyPose::new(config)?),
-            Self::Pgc(config) => Box::new(LocalizedPose::pgc(config)?),
-            Self::Tracked(config) => Box::new(TrackedPose::load(config)?),
-            Self::EndToEnd(config) => Box::new(LocalizedPose::end_to_end(config)?),
+            Self::Pgc(config) => Box::new(LocalizedPose::pgc(config, device)?),
+            Self::Tracked(config) => Box::new(TrackedPose::load(config, device)?),
+            Self::EndToEnd(config) => Box::new(LocalizedPose::end_to_end(config, device)?),
             Self::Cached(config) => Box::new(CachedPose::new(config)?),
         })
     }
@@ -328,7 +329,7 @@ mod tests {
             measured: Some(&pose),
             motion: EgoMotion::default(),
         };
-        let mut source = PoseSourceConfig::default().build().unwrap();
+        let mut source = PoseSourceConfig::default().build(Device::Cpu).unwrap();
         assert_eq!(source.estimate(&input), PoseEstimate::new(pose, 1.0));
         input.measured = None;
         assert_eq!(source.estimate(&input), NO_SOURCE);
@@ -345,10 +346,10 @@ mod tests {
         let config: PoseSourceConfig =
             serde_saphyr::from_str("pgc:\n  encoder: e.safetensors\n  head: h.safetensors\n").unwrap();
         assert_eq!(config.name(), "pgc");
-        let message = config.build().unwrap_err().to_string();
+        let message = config.build(Device::Cpu).unwrap_err().to_string();
         assert!(message.starts_with("e.safetensors"), "{message}");
         let config: PoseSourceConfig = serde_saphyr::from_str("end_to_end:\n  weights: w.safetensors\n").unwrap();
-        let message = config.build().unwrap_err().to_string();
+        let message = config.build(Device::Cpu).unwrap_err().to_string();
         assert!(config.name() == "end_to_end" && message.starts_with("w.safetensors"), "{message}");
     }
 }

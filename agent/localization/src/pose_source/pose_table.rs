@@ -232,6 +232,8 @@ mod tests {
     use protocol::PointCloud;
 
     use super::super::{PoseInput, PoseSourceConfig};
+    use tch::Device;
+
     use super::*;
 
     fn cav(name: &str) -> CavId {
@@ -265,7 +267,7 @@ mod tests {
         let config = |scenario: Option<&str>| {
             PoseSourceConfig::Cached(CachedPoseConfig { file: file.clone(), scenario: scenario.map(str::to_owned) })
         };
-        let mut source = config(Some("one")).build().unwrap();
+        let mut source = config(Some("one")).build(Device::Cpu).unwrap();
         let cloud = PointCloud::default();
         let mut ask = |cav, capture_nanos| {
             source.estimate(&PoseInput {
@@ -277,8 +279,8 @@ mod tests {
             })
         };
         assert_eq!((ask(&b, 100), ask(&b, 300)), (LOST, super::super::NO_SOURCE));
-        assert!(config(None).build().unwrap_err().to_string().contains("2 scenarios"));
-        assert!(config(Some("three")).build().unwrap_err().to_string().contains("three"));
+        assert!(config(None).build(Device::Cpu).unwrap_err().to_string().contains("2 scenarios"));
+        assert!(config(Some("three")).build(Device::Cpu).unwrap_err().to_string().contains("three"));
         assert_eq!(config(None).for_scenario("two"), config(Some("two")));
     }
 

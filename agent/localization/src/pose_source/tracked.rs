@@ -103,12 +103,12 @@ pub struct TrackedPose {
 }
 
 impl TrackedPose {
-    /// Reads the networks, to compute with on the CPU.
+    /// Reads the networks, to compute with on `device`.
     ///
     /// # Errors
     /// [`LocalizerError`] names the file and what is wrong with it.
-    pub fn load(config: &TrackedPoseConfig) -> Result<Self, LocalizerError> {
-        let localizer = Localizer::load(&config.encoder, &config.head, Device::Cpu)?;
+    pub fn load(config: &TrackedPoseConfig, device: Device) -> Result<Self, LocalizerError> {
+        let localizer = Localizer::load(&config.encoder, &config.head, device)?;
         Ok(Self::new(Box::new(localizer), config.clone()))
     }
 

@@ -19,7 +19,7 @@ use localization::pose_source::{PoseSource, TrackedPose, TrackedPoseConfig};
 use localization::registration::icp::IcpConfig;
 use localization::registration::ransac::RansacConfig;
 use localization::registration::sc2pcr::Sc2PcrConfig;
-use perception::train::cuda_device;
+use perception::compute_device::ComputeDevice;
 use perception::weights::annotate;
 use protocol::config::Section;
 use serde_json::json;
@@ -103,8 +103,8 @@ pub(crate) struct Args {
     #[arg(long, value_name = "FILE")]
     error_table: Option<PathBuf>,
     /// Device to compute on.
-    #[arg(long, value_enum, default_value_t = ComputeOn::Cpu)]
-    device: ComputeOn,
+    #[arg(long, value_enum, default_value_t)]
+    device: ComputeDevice,
     /// Threads to compute with.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=256))]
     threads: u16,
@@ -119,14 +119,6 @@ enum Search {
     Ransac,
     /// Second-order spatial compatibility.
     Sc2pcr,
-}
-
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-enum ComputeOn {
-    /// The CPU.
-    Cpu,
-    /// The first CUDA device.
-    Cuda,
 }
 
 /// Method under evaluation.
@@ -178,11 +170,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
 impl Args {
     fn subject(&self, head: &Path) -> Result<Subject, BadInput> {
         if self.icp_map.is_empty() {
-            let device = match self.device {
-                ComputeOn::Cpu => Device::Cpu,
-                ComputeOn::Cuda => cuda_device().map_err(BadInput::of)?,
-            };
-            return Ok(Subject::Localizer(self.localizer(head, device).map_err(BadInput::of)?));
+            return Ok(Subject::Localizer(self.localizer(head, self.device()?).map_err(BadInput::of)?));
         }
         if !self.map_spacing.is_finite() || self.map_spacing < 0.0 {
             return Err(BadInput::new(format!("--map-spacing is {}, must be 0 or more", self.map_spacing)));
@@ -192,10 +180,14 @@ impl Args {
         Ok(Subject::Source(Box::new(IcpMapPose::new(Arc::new(map), config))))
     }
 
+    fn device(&self) -> Result<Device, BadInput> {
+        self.device.open().map_err(|missing| BadInput::new(format!("--device cuda: {missing}")))
+    }
+
     fn tracking(&self, head: &Path) -> Result<Subject, BadInput> {
         let config = TrackedPoseConfig { encoder: self.encoder(head), head: head.to_owned(), ..self.tracker.0.clone() };
         config.validate().map_err(BadInput::of)?;
-        Ok(Subject::Source(Box::new(TrackedPose::load(&config).map_err(BadInput::of)?)))
+        Ok(Subject::Source(Box::new(TrackedPose::load(&config, self.device()?).map_err(BadInput::of)?)))
     }
 
     fn localizer(&self, head: &Path, device: Device) -> Result<Box<dyn Localize>, LocalizerError> {

@@ -9,6 +9,7 @@ use localization::pose_source::{LocalizedPose, PgcConfig, PoseInput, PoseRow, Po
 use protocol::PoseEstimate;
 use support::output;
 use support::progress;
+use tch::Device;
 
 use super::scene_heads::{SceneHeadFile, head_of};
 use support::cli::{BadInput, Outcome};
@@ -79,7 +80,7 @@ impl Args {
         let config = PgcConfig { encoder: self.encoder.clone(), head: head.to_owned(), motion_gate };
         let mut rows: Vec<PoseRow<'_>> = Vec::new();
         for (agent, cav) in scenario.agents.iter().enumerate() {
-            let mut source = LocalizedPose::pgc(&config).map_err(bad)?;
+            let mut source = LocalizedPose::pgc(&config, Device::Cpu).map_err(bad)?;
             for tick in (0..scenario.ticks.len()).filter(|&tick| scenario.is_present(agent, tick)) {
                 bar.inc(1);
                 let frame = match scenario.load(agent, tick, &LoadOptions::default()) {

@@ -31,12 +31,17 @@ use crate::weights::Weights;
 
 /// A trained PointPillars network in its fastest form, for one sweep at a time.
 ///
+/// Crop, voxels and the features of pillars are computed on the CPU in plain floats, and so are decoding and suppression
+/// of boxes; convolutions and heads run on [`Self::device`]. Feature maps stay there; messages and [`Heads`] are copied
+/// from it. CUDA computes asynchronously: the time of its convolutions is part of the copy of their result.
+///
 /// The same sweep gives the same bits in any process, as long as the number of torch threads is the same
 /// (`tch::set_num_threads`; live and offline runs use 1).
 #[derive(Debug)]
 pub struct Detector {
     config: DetectorConfig,
     sha256: String,
+    device: Device,
     crop: Crop,
     voxeliser: Voxeliser,
     pillar_grid: PillarGrid,
@@ -51,33 +56,34 @@ pub struct Detector {
 }
 
 impl Detector {
-    /// Reads a weights file, configuration included.
+    /// Reads a weights file, configuration included, to compute on `device`.
     ///
     /// # Errors
     /// [`DetectorError`] names the file, the tensor and both shapes.
-    pub fn load(path: &Path) -> Result<Self, DetectorError> {
+    pub fn load(path: &Path, device: Device) -> Result<Self, DetectorError> {
         let weights = Weights::load(path)?;
-        Self::from_weights(&weights, &weights.config()?)
+        Self::from_weights(&weights, &weights.config()?, device)
     }
 
     /// Builds the detector that `config` describes from a file already read.
     ///
     /// # Errors
     /// See [`Self::load`].
-    pub fn from_weights(weights: &Weights, config: &DetectorConfig) -> Result<Self, DetectorError> {
-        let network = VarStore::new(Device::Cpu);
+    pub fn from_weights(weights: &Weights, config: &DetectorConfig, device: Device) -> Result<Self, DetectorError> {
+        let network = VarStore::new(device);
         let pillars = PointPillars::new(&network.root(), config)?;
         weights.copy_into(&network)?;
         Ok(Self { sha256: weights.sha256().to_owned(), ..Self::from_network(pillars) })
     }
 
-    /// Uses a network on the CPU, trained or not; its norms are folded into the convolutions.
+    /// Uses a network, trained or not, on its device; its norms are folded into the convolutions.
     #[must_use]
     pub fn from_network(network: PointPillars) -> Self {
         let pillar_grid = *network.pillar_grid();
         let projection = PillarProjection::new(&network.encoder);
         tch::no_grad(|| Self {
             sha256: String::new(),
+            device: network.device(),
             crop: Crop::for_detector(&network.config),
             voxeliser: Voxeliser::for_detector(&network.config),
             backbone: network.backbone.folded(),
@@ -97,6 +103,12 @@ impl Detector {
     #[must_use]
     pub fn config(&self) -> &DetectorConfig {
         &self.config
+    }
+
+    /// Device of its feature maps.
+    #[must_use]
+    pub fn device(&self) -> Device {
+        self.device
     }
 
     /// SHA-256 of its weights file; empty if it was not read from one.
@@ -181,7 +193,8 @@ impl Detector {
         self.canvas.fill(0.0);
         self.projection.scatter(&pillars, &self.pillar_grid, &mut self.canvas);
         let (height, width) = (self.pillar_grid.height as i64, self.pillar_grid.width as i64);
-        let canvas = Tensor::f_from_slice(&self.canvas)?.f_view([1, height, width, -1])?.f_permute([0, 3, 1, 2])?;
+        let canvas = Tensor::f_from_slice(&self.canvas)?.f_view([1, height, width, -1])?.f_to_device(self.device)?;
+        let canvas = canvas.f_permute([0, 3, 1, 2])?;
         times.lap("pillars");
         let features = tch::no_grad(|| {
             let wide = self.backbone.forward(&canvas, false);
@@ -241,12 +254,13 @@ impl Detector {
                 expected: self.sent_shape(),
             });
         }
-        let decompressed = self.decompressed(&Tensor::f_from_slice(values)?.f_view([1, expected, height, width])?)?;
+        let values = Tensor::f_from_slice(values)?.f_view([1, expected, height, width])?;
+        let decompressed = self.decompressed(&values.f_to_device(self.device)?)?;
         match (sent, &self.compressor) {
             // The expansion spreads the sent cells to their neighbours, and the bias everywhere.
             (Some(sent), Some(_)) => {
                 let sent = Tensor::f_from_slice(sent)?.f_to_kind(Kind::Float)?.f_view([1, 1, height, width])?;
-                Ok(decompressed.f_mul(&sent)?)
+                Ok(decompressed.f_mul(&sent.f_to_device(self.device)?)?)
             }
             _ => Ok(decompressed),
         }
@@ -461,7 +475,7 @@ mod tests {
         let path = folder.path().join("lean.safetensors");
         let metadata: BTreeMap<_, _> = [(CONFIG_KEY.to_owned(), serde_json::to_string(&config()).unwrap())].into();
         let sha256 = weights::save(&path, &store, &metadata, Precision::Single).unwrap();
-        let mut loaded = Detector::load(&path).unwrap();
+        let mut loaded = Detector::load(&path, Device::Cpu).unwrap();
         assert_eq!((loaded.sha256(), loaded.config()), (sha256.as_str(), &config()));
         let mut original = Detector::from_network(pillars);
         assert!(loaded.encode(&cloud()).unwrap().features.equal(&original.encode(&cloud()).unwrap().features));

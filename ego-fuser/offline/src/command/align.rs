@@ -19,6 +19,7 @@ use perception::detector::Detector;
 use protocol::CavId;
 use support::output;
 use support::progress;
+use tch::Device;
 
 use super::scenarios;
 use support::cli::BadInput;
@@ -167,7 +168,7 @@ impl Arguments {
         let Some(weights) = &self.weights else {
             return Err(BadInput::new("detected boxes need --weights FILE; or use --boxes annotated").into());
         };
-        let detector = Detector::load(weights).map_err(BadInput::of)?;
+        let detector = Detector::load(weights, Device::Cpu).map_err(BadInput::of)?;
         let cav = CavId::new("detector").context("a name")?;
         Ok(BoxSource::Detected(Box::new(Agent::new(cav, Box::new(RecordedPose), detector))))
     }
@@ -191,6 +192,6 @@ fn from_source(source: &NamedSource) -> Result<AlignmentSpec> {
     let text = std::fs::read_to_string(file).map_err(|error| bad(&error))?;
     let config: PoseSourceConfig = serde_saphyr::from_str(&text).map_err(|error| bad(&error))?;
     // Built once without use, so that a missing file is found before the first scene.
-    config.build().map_err(|error| bad(&error))?;
-    Ok(Poses::spec(name.clone(), Measured::True, move || config.build()))
+    config.build(Device::Cpu).map_err(|error| bad(&error))?;
+    Ok(Poses::spec(name.clone(), Measured::True, move || config.build(Device::Cpu)))
 }
