@@ -61,6 +61,9 @@ impl Capacity {
     /// # Errors
     /// The error of that process, or of starting it.
     pub fn estimate_apart(fleet: &Fleet, programs: &Path) -> io::Result<Option<Self>> {
+        if !has_pace(fleet) {
+            return Ok(None);
+        }
         let mut command = Command::new(programs.join("v2vloc"));
         command.arg("capacity").stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped());
         let mut child = command.spawn()?;
@@ -81,12 +84,9 @@ impl Capacity {
     /// [`RunError`] when models or frames cannot be loaded or computed.
     pub fn estimate(fleet: &Fleet) -> Result<Option<Self>, RunError> {
         let scene = &fleet.scenario.scene;
-        let on_cpu = fleet.scenario.models.device == ComputeDevice::Cpu;
         let recorded = recorded(fleet)?;
         let steps = recorded.ticks.windows(2).map(|pair| pair[1].capture_nanos.saturating_sub(pair[0].capture_nanos));
-        let Some(period_nanos) = steps.min().filter(|_| !scene.lockstep && scene.rate > 0.0 && on_cpu) else {
-            return Ok(None);
-        };
+        let Some(period_nanos) = steps.min().filter(|_| has_pace(fleet)) else { return Ok(None) };
         let period_ms = period_nanos as f64 * 1e-6 / scene.rate;
         fleet.scenario.models.threads.apply();
         let vehicles = fleet.agents.len();
@@ -166,6 +166,11 @@ impl fmt::Display for Capacity {
             (10.0 * self.expected_share).round()
         )
     }
+}
+
+/// True if a run has a pace of its own, and one that can be estimated.
+fn has_pace(Fleet { scenario, .. }: &Fleet) -> bool {
+    !scenario.scene.lockstep && scenario.scene.rate > 0.0 && scenario.models.device == ComputeDevice::Cpu
 }
 
 /// Changes that let a fleet answer more ticks, the mildest first, as text: `tracked poses, method max or clock: stepped`.
