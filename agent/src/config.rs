@@ -14,6 +14,7 @@ use crate::attack::Falsification;
 use crate::node::NodeOptions;
 use crate::rate::RateConfig;
 use localization::pose_source::PoseSourceConfig;
+use perception::compute_device::{ComputeDevice, NoCuda};
 use perception::inference::Inference;
 use perception::int8::InferencePrecision;
 use perception::weights::{Weights, WeightsError};
@@ -40,7 +41,7 @@ pub struct AgentConfig {
     #[arg(long, value_name = "FILE")]
     #[serde(default)]
     pub sweep_log: Option<PathBuf>,
-    /// Detector and threads.
+    /// Detector, threads and device.
     #[command(flatten)]
     pub models: ModelConfig,
     /// Pose, codec and rate control.
@@ -53,7 +54,7 @@ pub struct AgentConfig {
     pub bus: BusConfig,
 }
 
-/// Detector of a process and its number of threads.
+/// Detector of a process, and where and with how many threads it computes.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema, clap::Args)]
 #[serde(deny_unknown_fields)]
 pub struct ModelConfig {
@@ -68,21 +69,38 @@ pub struct ModelConfig {
     #[arg(long)]
     #[serde(default)]
     pub threads: Threads,
+    /// Device that the networks compute on; cuda needs a libtorch with CUDA and a CUDA device, and its results are
+    /// slightly different.
+    #[arg(long, value_enum)]
+    #[serde(default)]
+    pub device: ComputeDevice,
 }
 
 impl ModelConfig {
-    /// Reads the weights for the configured number format.
+    /// Checks that the processes can compute as configured.
+    ///
+    /// # Errors
+    /// [`FieldError`] for a number of threads out of range, or a device that is missing.
+    pub fn validate(&self) -> Result<(), FieldError> {
+        self.threads.validate()?;
+        self.inference().map(drop)
+    }
+
+    /// Reads the weights, to compute with as [`Self::inference`] says.
     ///
     /// # Errors
     /// [`WeightsError`] names the file.
-    pub fn load(&self) -> Result<Weights, WeightsError> {
-        Ok(Weights::load(&self.weights)?.with_precision(self.precision))
+    pub fn load(&self, inference: Inference) -> Result<Weights, WeightsError> {
+        Ok(Weights::load(&self.weights)?.with_precision(inference.precision))
     }
 
     /// How networks are computed.
-    #[must_use]
-    pub fn inference(&self) -> Inference {
-        Inference { precision: self.precision, ..Inference::default() }
+    ///
+    /// # Errors
+    /// [`FieldError`] names what a device needs and this machine lacks.
+    pub fn inference(&self) -> Result<Inference, FieldError> {
+        let missing = |missing: NoCuda| FieldError::new("models.device", "cuda", missing.to_string());
+        Ok(Inference::new(self.device.open().map_err(missing)?, self.precision))
     }
 }
 
@@ -182,7 +200,7 @@ impl ProcessConfig for AgentConfig {
     const REQUIRED: &'static [&'static str] = &["run", "cav", "models.weights"];
 
     fn validate(&self) -> Result<(), FieldError> {
-        self.models.threads.validate()?;
+        self.models.validate()?;
         self.settings.validate()?;
         self.bus.validate()
     }

@@ -13,7 +13,7 @@ use bus::{Arrival, Bus, BusError, Event, Inbox, MessageStats, Publisher, Publish
 use protocol::codec::CodecConfig;
 use protocol::message::{Bev, Boxes, Descriptor, Points};
 use protocol::{
-    DropReason, Dtype, Gnss, KeyExpr, Lidar, Limits, Pace, PointCloud, PoseEstimate, Role, Stream, Topic, wire,
+    CavId, DropReason, Dtype, Gnss, KeyExpr, Lidar, Limits, Pace, PointCloud, PoseEstimate, Role, Stream, Topic, wire,
 };
 use support::nanos;
 
@@ -73,6 +73,8 @@ pub struct NodeReport {
     pub failed: u64,
     /// Poses that the vehicle cannot have reached from the previous ones; they are published with little confidence.
     pub pose_jumps: u64,
+    /// Messages of egos whose pace is not followed, because there are too many egos.
+    pub unfollowed_paces: u64,
 }
 
 /// Runs `agent` on the calling thread until the replay ends or `stop` is requested.
@@ -184,7 +186,8 @@ impl<'a> Node<'a> {
                     self.advance(Instant::now() + POSE_TIMEOUT);
                     return;
                 }
-                Pop::Item(_, Event::End { .. }) | Pop::TimedOut => {}
+                Pop::Item(topic, Event::End { .. }) => self.forget_pace(&topic),
+                Pop::TimedOut => {}
                 Pop::Closed => return,
             }
             self.advance(Instant::now());
@@ -195,10 +198,9 @@ impl<'a> Node<'a> {
         let capture_nanos = arrival.header.stamp.capture_nanos;
         if let Topic::Stream { cav, stream: Stream::Pace } = &arrival.topic {
             if let Some(pace) = self.inbox.decode::<Pace>(&arrival, &self.options.limits) {
-                self.selection.follow(cav, pace);
-                self.bus.stats().received(&arrival.topic);
+                self.follow_pace(cav, pace);
             }
-        } else if arrival.topic == self.lidar && !self.selection.admits(capture_nanos) {
+        } else if arrival.topic == self.lidar && !self.selection.admits(capture_nanos, Instant::now()) {
             self.bus.stats().dropped(&self.lidar, DropReason::Paced);
         } else if arrival.topic == self.lidar {
             let superseded = self.pairing.add_sweep(capture_nanos, arrival, Instant::now());
@@ -213,6 +215,23 @@ impl<'a> Node<'a> {
         } else if let Some(Gnss { world_from_lidar, .. }) = self.inbox.decode(&arrival, &self.options.limits) {
             let poses = self.pairing.add_pose(capture_nanos, world_from_lidar);
             self.count_unused(Unused { poses, ..Unused::default() });
+        }
+    }
+
+    /// Follows the pace of an ego; one beyond the limit of egos is counted, and the first is logged.
+    fn follow_pace(&mut self, ego: &CavId, pace: Pace) {
+        if !self.selection.follow(ego, pace, Instant::now()) {
+            if self.report.unfollowed_paces == 0 {
+                tracing::warn!(%ego, followed = MAX_EGOS, "more egos than are followed: paces of others are ignored");
+            }
+            self.report.unfollowed_paces += 1;
+        }
+    }
+
+    /// An ego whose stream of paces has ended has left.
+    fn forget_pace(&mut self, topic: &Topic) {
+        if let Topic::Stream { cav, stream: Stream::Pace } = topic {
+            self.selection.forget(cav);
         }
     }
 

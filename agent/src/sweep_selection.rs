@@ -1,33 +1,61 @@
 //! Sweep selection: leaves out sweeps that no ego has time for, the same in every vehicle.
 
 use std::collections::BTreeMap;
+use std::time::{Duration, Instant};
 
 use protocol::{CavId, Pace};
 
 /// Largest number of egos whose pace is followed.
 pub(crate) const MAX_EGOS: usize = 64;
+/// Silence after which the pace of an ego is forgotten: it repeats its pace every second.
+const MAX_SILENCE: Duration = Duration::from_secs(5);
 
 /// Paces of the egos, and the interval of the last computed sweep under each.
 #[derive(Debug, Default)]
 pub(crate) struct SweepSelection {
-    paces: BTreeMap<CavId, (Pace, Option<i128>)>,
+    paces: BTreeMap<CavId, Followed>,
+}
+
+/// Pace of one ego.
+#[derive(Debug)]
+struct Followed {
+    pace: Pace,
+    /// Interval of the last computed sweep.
+    last: Option<i128>,
+    heard: Instant,
 }
 
 impl SweepSelection {
-    /// Follows the pace of an ego from now on.
-    pub(crate) fn follow(&mut self, ego: &CavId, pace: Pace) {
-        let known = self.paces.get(ego).map(|(known, _)| *known);
-        // Egos repeat their pace.
-        if known != Some(pace) && (known.is_some() || self.paces.len() < MAX_EGOS) {
-            self.paces.insert(ego.clone(), (pace, None));
+    /// Follows the pace of an ego from now on. False if there are too many egos already.
+    #[must_use]
+    pub(crate) fn follow(&mut self, ego: &CavId, pace: Pace, now: Instant) -> bool {
+        let known = self.paces.get(ego);
+        if known.is_none() && self.paces.len() >= MAX_EGOS {
+            return false;
         }
+        // Egos repeat their pace, which does not begin anew.
+        let last = known.filter(|known| known.pace == pace).and_then(|known| known.last);
+        self.paces.insert(ego.clone(), Followed { pace, last, heard: now });
+        true
+    }
+
+    /// Forgets the pace of an ego that has left.
+    pub(crate) fn forget(&mut self, ego: &CavId) {
+        self.paces.remove(ego);
     }
 
     /// True if a sweep is computed: it is the first of an interval of any ego, or there is no pace. A capture time
     /// before the last one begins anew.
-    pub(crate) fn admits(&mut self, capture_nanos: u64) -> bool {
+    pub(crate) fn admits(&mut self, capture_nanos: u64, now: Instant) -> bool {
+        self.paces.retain(|ego, followed| {
+            let is_heard = now.saturating_duration_since(followed.heard) <= MAX_SILENCE;
+            if !is_heard {
+                tracing::info!(%ego, "the ego is silent: its pace is forgotten");
+            }
+            is_heard
+        });
         let mut is_admitted = self.paces.is_empty();
-        for (pace, last) in self.paces.values_mut() {
+        for Followed { pace, last, .. } in self.paces.values_mut() {
             let interval = pace.interval_of(capture_nanos);
             if interval.is_none() || interval != *last {
                 is_admitted = true;
@@ -42,8 +70,8 @@ impl SweepSelection {
 mod tests {
     use super::*;
 
-    fn computed(selection: &mut SweepSelection, sweeps: std::ops::Range<u64>) -> Vec<u64> {
-        sweeps.filter(|sweep| selection.admits(sweep * 100_000_000)).collect()
+    fn computed(selection: &mut SweepSelection, sweeps: std::ops::Range<u64>, now: Instant) -> Vec<u64> {
+        sweeps.filter(|sweep| selection.admits(sweep * 100_000_000, now)).collect()
     }
 
     fn every(sweeps: u64) -> Pace {
@@ -52,24 +80,52 @@ mod tests {
 
     #[test]
     fn vehicles_that_hear_of_a_pace_at_different_times_compute_the_same_sweeps() {
-        let ego = CavId::new("1").unwrap();
+        let (ego, now) = (CavId::new("1").unwrap(), Instant::now());
         let (mut early, mut late) = (SweepSelection::default(), SweepSelection::default());
-        assert_eq!(computed(&mut early, 0..3), [0, 1, 2]);
-        early.follow(&ego, every(3));
-        assert_eq!(computed(&mut early, 3..12), [3, 6, 9]);
-        assert_eq!(computed(&mut late, 0..4), [0, 1, 2, 3]);
-        late.follow(&ego, every(3));
-        assert_eq!(computed(&mut late, 4..12), [4, 6, 9], "from the next interval on");
-        late.follow(&ego, Pace::EVERY_SWEEP);
-        assert_eq!(computed(&mut late, 12..15), [12, 13, 14]);
+        assert_eq!(computed(&mut early, 0..3, now), [0, 1, 2]);
+        assert!(early.follow(&ego, every(3), now));
+        assert_eq!(computed(&mut early, 3..12, now), [3, 6, 9]);
+        assert_eq!(computed(&mut late, 0..4, now), [0, 1, 2, 3]);
+        assert!(late.follow(&ego, every(3), now));
+        assert_eq!(computed(&mut late, 4..12, now), [4, 6, 9], "from the next interval on");
+        assert!(late.follow(&ego, Pace::EVERY_SWEEP, now));
+        assert_eq!(computed(&mut late, 12..15, now), [12, 13, 14]);
     }
 
     #[test]
     fn the_fastest_ego_is_served_and_a_restarted_scene_too() {
-        let mut selection = SweepSelection::default();
-        selection.follow(&CavId::new("1").unwrap(), every(4));
-        selection.follow(&CavId::new("2").unwrap(), every(2));
-        assert_eq!(computed(&mut selection, 3..12), [3, 5, 7, 9, 11]);
-        assert_eq!(computed(&mut selection, 0..4), [0, 1, 3]);
+        let (mut selection, now) = (SweepSelection::default(), Instant::now());
+        assert!(selection.follow(&CavId::new("1").unwrap(), every(4), now));
+        assert!(selection.follow(&CavId::new("2").unwrap(), every(2), now));
+        assert_eq!(computed(&mut selection, 3..12, now), [3, 5, 7, 9, 11]);
+        assert_eq!(computed(&mut selection, 0..4, now), [0, 1, 3]);
+    }
+
+    #[test]
+    fn egos_that_leave_or_are_silent_are_forgotten() {
+        let (mut selection, now) = (SweepSelection::default(), Instant::now());
+        let [slow, fast, faster] = ["1", "2", "3"].map(|ego| CavId::new(ego).unwrap());
+        let later = now + MAX_SILENCE;
+        assert!(selection.follow(&slow, every(4), now) && selection.follow(&fast, every(2), now));
+        assert!(selection.follow(&faster, Pace::EVERY_SWEEP, now));
+        assert_eq!(computed(&mut selection, 3..7, now), [3, 4, 5, 6]);
+        selection.forget(&faster);
+        assert_eq!(computed(&mut selection, 7..15, now), [7, 9, 11, 13]);
+        assert!(selection.follow(&slow, every(4), later), "it repeats its pace");
+        assert_eq!(computed(&mut selection, 15..19, later), [15, 17]);
+        let silent = later + Duration::from_millis(1);
+        assert_eq!(computed(&mut selection, 19..27, silent), [19, 23]);
+        assert_eq!(computed(&mut selection, 27..30, silent + MAX_SILENCE), [27, 28, 29]);
+    }
+
+    #[test]
+    fn more_egos_than_are_followed_are_refused() {
+        let (mut selection, now) = (SweepSelection::default(), Instant::now());
+        let ego = |number: usize| CavId::new(&number.to_string()).unwrap();
+        assert!((0..MAX_EGOS).all(|number| selection.follow(&ego(number), every(2), now)));
+        assert!(!selection.follow(&ego(MAX_EGOS), every(1), now));
+        assert!(selection.follow(&ego(0), every(3), now), "known ones may change");
+        selection.forget(&ego(0));
+        assert!(selection.follow(&ego(MAX_EGOS), every(1), now));
     }
 }

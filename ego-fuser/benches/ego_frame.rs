@@ -28,6 +28,7 @@ use protocol::{CodecConfig, EncodedFeatures, Limits, Pose, PoseEstimate};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use support::stage_times::StageTimes;
+use tch::Device;
 
 /// Largest error of a pose along x and y, metres.
 const POSE_ERROR_M: f64 = 0.2;
@@ -90,7 +91,7 @@ fn main() -> Result<(), Failure> {
             let frames = sent(&scenario, &weights, method, [vehicles, arguments.frames])?;
             let mut best: Vec<BTreeMap<String, f64>> = vec![BTreeMap::new(); frames.len()];
             for run in 0..arguments.runs {
-                let mut ego = Ego::from_weights(&weights, Some(method))?;
+                let mut ego = Ego::from_weights(&weights, Some(method), Device::Cpu)?;
                 for (index, (frame, best)) in frames.iter().zip(&mut best).enumerate() {
                     let found = timed(&mut ego, frame, best)?;
                     if run + 1 == arguments.runs {
@@ -154,7 +155,7 @@ fn sent(
     let mut agents = Vec::new();
     for cav in scenario.agents.iter().take(vehicles) {
         let source = PoseSourceConfig::Recorded.for_scenario(&scenario.name).build(Inference::default())?;
-        agents.push(Agent::new(cav.clone(), source, Detector::from_weights(weights, &weights.config()?)?));
+        agents.push(Agent::new(cav.clone(), source, Detector::from_weights(weights, &weights.config()?, Device::Cpu)?));
     }
     let mut all = Vec::with_capacity(frames);
     for tick in 0..frames {

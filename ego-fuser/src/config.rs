@@ -19,7 +19,7 @@ pub struct EgoConfig {
     /// Name of the run: 1 to 32 characters of a-z, 0-9, '_' and '-'.
     #[arg(long, required_unless_present = "config")]
     pub run: RunId,
-    /// Detector and threads.
+    /// Detector, threads and device.
     #[command(flatten)]
     pub models: ModelConfig,
     /// A method of `ego-fuser methods`. Absent: the one that the weights were trained for.
@@ -136,7 +136,7 @@ impl ProcessConfig for EgoConfig {
     const REQUIRED: &'static [&'static str] = &["run", "models.weights"];
 
     fn validate(&self) -> Result<(), FieldError> {
-        self.models.threads.validate()?;
+        self.models.validate()?;
         self.ego.validate()?;
         if self.ego.id.is_none() {
             return Err(FieldError::new("ego.id", "absent", "must name the vehicle that fuses (--ego)"));

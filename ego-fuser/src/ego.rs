@@ -68,26 +68,26 @@ impl Ego {
     /// The communication range of OPV2V and related data sets, metres: the default.
     pub const COMM_RANGE_M: f64 = 70.0;
 
-    /// Reads the weights; `method` overrides the one that the file names.
+    /// Reads the weights, to compute on `device`; `method` overrides the one that the file names.
     ///
     /// # Errors
     /// [`EgoError`] names the file, the tensor and both shapes.
-    pub fn load(path: &Path, method: Option<Method>) -> Result<Self, EgoError> {
-        Self::from_weights(&Weights::load(path)?, method)
+    pub fn load(path: &Path, method: Option<Method>, device: Device) -> Result<Self, EgoError> {
+        Self::from_weights(&Weights::load(path)?, method, device)
     }
 
     /// The same from a file already read.
     ///
     /// # Errors
     /// As [`Self::load`].
-    pub fn from_weights(weights: &Weights, method: Option<Method>) -> Result<Self, EgoError> {
+    pub fn from_weights(weights: &Weights, method: Option<Method>, device: Device) -> Result<Self, EgoError> {
         let method = match (method, weights.metadata(METHOD_KEY)) {
             (Some(method), _) => method,
             (None, Some(name)) => name.parse()?,
             (None, None) => Method::NONE,
         };
-        let detector = Detector::from_weights(weights, &weights.config()?)?;
-        let fusion = FusionStage::from_weights(weights, method, detector.config())?;
+        let detector = Detector::from_weights(weights, &weights.config()?, device)?;
+        let fusion = FusionStage::from_weights(weights, method, detector.config(), device)?;
         Ok(Self::assembled(detector, method, fusion))
     }
 
@@ -96,7 +96,7 @@ impl Ego {
     /// # Errors
     /// [`EgoError::Fusion`] when no fusion can be built behind the detector.
     pub fn new(detector: Detector, method: Method) -> Result<Self, EgoError> {
-        let fusion = FusionStage::untrained(method, detector.config()).map_err(StageError::from)?;
+        let fusion = FusionStage::untrained(method, detector.config(), detector.device()).map_err(StageError::from)?;
         Ok(Self::assembled(detector, method, fusion))
     }
 
@@ -299,7 +299,8 @@ impl Ego {
                 expected: self.detector.grid(),
             });
         }
-        Ok((self.detector.received(map)?, sent_cells(map, is_ego, [height, width])?))
+        let sent = sent_cells(map, is_ego, [height, width])?.f_to_device(self.detector.device())?;
+        Ok((self.detector.received(map)?, sent))
     }
 
     /// The kept maps of the vehicles that take part, with their poses in the ego's current frame. An ego without a pose
@@ -412,7 +413,7 @@ impl Aligned<'_> {
 fn sent_cells(map: &DecodedFeatures, is_ego: bool, [height, width]: [i64; 2]) -> Result<Tensor, TchError> {
     match &map.sent {
         Some(sent) if !is_ego => Tensor::f_from_slice(sent)?.f_to_kind(Kind::Float)?.f_view([1, 1, height, width]),
-        _ => Tensor::f_ones([1, 1, height, width], (Kind::Float, tch::Device::Cpu)),
+        _ => Tensor::f_ones([1, 1, height, width], (Kind::Float, Device::Cpu)),
     }
 }
 

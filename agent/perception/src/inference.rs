@@ -1,4 +1,4 @@
-//! How networks are computed in inference.
+//! Inference: device and number format of networks.
 
 use tch::Device;
 
@@ -13,14 +13,23 @@ pub struct Inference {
     pub precision: InferencePrecision,
 }
 
-impl Default for Inference {
-    /// On the CPU, in integers where the weights allow it.
-    fn default() -> Self {
-        Self { device: Device::Cpu, precision: InferencePrecision::default() }
-    }
-}
-
 impl Inference {
     /// On the CPU in floating point.
     pub const FLOAT: Self = Self { device: Device::Cpu, precision: InferencePrecision::Float };
+
+    /// On a device, in a number format; integers are for the CPU only.
+    #[must_use]
+    pub fn new(device: Device, precision: InferencePrecision) -> Self {
+        match device {
+            Device::Cpu => Self { device, precision },
+            _ => Self { device, precision: InferencePrecision::Float },
+        }
+    }
+}
+
+impl Default for Inference {
+    /// On the CPU, in integers where the weights allow it.
+    fn default() -> Self {
+        Self::new(Device::Cpu, InferencePrecision::default())
+    }
 }

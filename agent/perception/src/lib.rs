@@ -5,6 +5,7 @@
 //! - [`int8`]: the same layers in 8-bit integers, for inference.
 //! - [`sparse`]: sparse convolution, for the scene encoder of the localization.
 //! - [`weights`], [`model_config`]: checkpoints and the sizes of a model.
+//! - [`compute_device`]: where networks compute.
 //! - [`train`]: optimiser, schedule, checkpoints and progress of every training.
 //!
 //! Tensors are `[N, C, H, W]`; the row of a BEV feature map grows with y, the column with x.
@@ -12,6 +13,7 @@
 #![warn(clippy::print_stdout, clippy::print_stderr)]
 
 pub mod boxes;
+pub mod compute_device;
 pub mod crop;
 pub mod detector;
 pub mod inference;

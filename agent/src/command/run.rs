@@ -50,9 +50,10 @@ pub(crate) fn run(args: Args) -> anyhow::Result<()> {
 }
 
 fn agent(config: &AgentConfig) -> anyhow::Result<Agent> {
-    let weights = config.models.load().context("weights")?;
-    let detector = Detector::from_weights(&weights, &weights.config()?).context("weights")?;
-    Ok(Agent::new(config.cav.clone(), config.settings.pose.build(config.models.inference())?, detector))
+    let inference = config.models.inference()?;
+    let weights = config.models.load(inference).context("weights")?;
+    let detector = Detector::from_weights(&weights, &weights.config()?, inference.device).context("weights")?;
+    Ok(Agent::new(config.cav.clone(), config.settings.pose.build(inference)?, detector))
 }
 
 fn output_filter(config: &AgentConfig) -> Box<dyn OutputFilter> {

@@ -1,5 +1,6 @@
 //! One file per subcommand: its arguments, and the call into the library.
 
+mod capacity;
 mod demo;
 mod eval;
 mod keys;
@@ -30,6 +31,9 @@ use support::output;
 /// Subcommands of `v2vloc`.
 #[derive(Debug, clap::Subcommand)]
 pub(crate) enum Command {
+    /// Estimate the pace of a run, in a process of its own.
+    #[command(hide = true)]
+    Capacity(capacity::Arguments),
     /// Generate a scene if there is none, run a fleet on it and print the result.
     Demo(Box<demo::Arguments>),
     /// Evaluate methods on recorded scenes without a network: AP, pose errors, bytes.
@@ -60,6 +64,7 @@ impl Command {
         let settings = [malloc_settings::KEPT_MEMORY.as_slice(), &[malloc_settings::ROUTER_THREADS]].concat();
         malloc_settings::ensure(&settings).context("this program again")?;
         match self {
+            Self::Capacity(arguments) => arguments.run(),
             Self::Demo(arguments) => arguments.run(),
             Self::Eval(arguments) => arguments.run(),
             Self::Status(arguments) => arguments.run(),

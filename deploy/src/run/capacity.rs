@@ -1,13 +1,16 @@
 //! Capacity: estimate of the pace of a live run on this machine, from a few frames of its scene, and what would help
 //! where it does not keep up.
 
-use std::fmt;
+use std::path::Path;
+use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
+use std::{fmt, io};
 
 use bus::process_cpu_s;
 use ego_fuser_offline::evaluation::Evaluator;
 use ego_fuser_offline::evaluation::stepped::ComputeTimes;
 use fusion::{Exchange, Method};
+use perception::compute_device::ComputeDevice;
 use serde::{Deserialize, Serialize};
 
 use crate::operate::RunError;
@@ -52,8 +55,30 @@ pub struct Capacity {
 }
 
 impl Capacity {
+    /// [`Self::estimate`] in a short-lived process of its own, so that models and their memory are not kept by the
+    /// process that runs the fleet. `programs` is the folder of `v2vloc`.
+    ///
+    /// # Errors
+    /// The error of that process, or of starting it.
+    pub fn estimate_apart(fleet: &Fleet, programs: &Path) -> io::Result<Option<Self>> {
+        if !has_pace(fleet) {
+            return Ok(None);
+        }
+        let mut command = Command::new(programs.join("v2vloc"));
+        command.arg("capacity").stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped());
+        let mut child = command.spawn()?;
+        // A process that ends before it has read the scenario says why itself.
+        drop(child.stdin.take().map(|stdin| serde_json::to_writer(stdin, &fleet.scenario)));
+        let output = child.wait_with_output()?;
+        if output.status.success() {
+            return Ok(serde_json::from_slice(&output.stdout)?);
+        }
+        let reasons = String::from_utf8_lossy(&output.stderr);
+        Err(io::Error::other(reasons.lines().last().unwrap_or_default().to_owned()))
+    }
+
     /// Estimates the pace of a fleet. `None` for a run without a pace of its own: in lockstep, as fast as possible, or
-    /// of a single tick.
+    /// of a single tick; and for networks that do not compute on the CPU, which is what is measured.
     ///
     /// # Errors
     /// [`RunError`] when models or frames cannot be loaded or computed.
@@ -61,7 +86,7 @@ impl Capacity {
         let scene = &fleet.scenario.scene;
         let recorded = recorded(fleet)?;
         let steps = recorded.ticks.windows(2).map(|pair| pair[1].capture_nanos.saturating_sub(pair[0].capture_nanos));
-        let Some(period_nanos) = steps.min().filter(|_| !scene.lockstep && scene.rate > 0.0) else { return Ok(None) };
+        let Some(period_nanos) = steps.min().filter(|_| has_pace(fleet)) else { return Ok(None) };
         let period_ms = period_nanos as f64 * 1e-6 / scene.rate;
         fleet.scenario.models.threads.apply();
         let vehicles = fleet.agents.len();
@@ -141,6 +166,11 @@ impl fmt::Display for Capacity {
             (10.0 * self.expected_share).round()
         )
     }
+}
+
+/// True if a run has a pace of its own, and one that can be estimated.
+fn has_pace(Fleet { scenario, .. }: &Fleet) -> bool {
+    !scenario.scene.lockstep && scenario.scene.rate > 0.0 && scenario.models.device == ComputeDevice::Cpu
 }
 
 /// Changes that let a fleet answer more ticks, the mildest first, as text: `tracked poses, method max or clock: stepped`.

@@ -110,8 +110,8 @@ pub fn run_scenario(scenario: &Scenario, options: &RunOptions) -> Result<RunResu
 }
 
 /// Prints what this machine can carry. A run whose pace cannot be estimated goes on without.
-fn announce_capacity(fleet: &Fleet) -> Option<Capacity> {
-    let capacity = Capacity::estimate(fleet).unwrap_or_else(|error| {
+fn announce_capacity(fleet: &Fleet, programs: &Path) -> Option<Capacity> {
+    let capacity = Capacity::estimate_apart(fleet, programs).unwrap_or_else(|error| {
         tracing::warn!("the pace of the run cannot be estimated: {error}");
         None
     })?;
@@ -127,7 +127,7 @@ fn go(fleet: &Fleet, options: &RunOptions, run: &RunId, folder: &RunFolder) -> R
     let stop = Stop::new();
     stop.on_signals().map_err(RunError::Signals)?;
     // Before anything else of the run takes the cores.
-    let capacity = announce_capacity(fleet);
+    let capacity = announce_capacity(fleet, &options.programs);
     let fingerprint = fingerprint(fleet, &options.programs);
 
     let keys = fleet.keys(folder)?;

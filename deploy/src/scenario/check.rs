@@ -4,6 +4,7 @@ use std::path::Path;
 
 use bus::Endpoint;
 use bus::config_file::ConfigError;
+use perception::compute_device::ComputeDevice;
 use protocol::config::{FieldError, above_zero, within};
 
 use super::{Clock, Scenario, ScenarioError};
@@ -21,6 +22,7 @@ impl Scenario {
     fn check_values(&self) -> Result<(), FieldError> {
         self.check_numbers()?;
         self.check_clock()?;
+        self.models.validate()?;
         self.check_security()?;
         self.check_network()?;
         match &self.ego.id {
@@ -44,7 +46,6 @@ impl Scenario {
             above_zero(field, number)?;
         }
         scene.validate()?;
-        self.models.threads.validate()?;
         self.ego.validate()?;
         self.settings().try_for_each(|settings| settings.validate())?;
         self.record.as_ref().map_or(Ok(()), |record| record.validate())
@@ -122,6 +123,10 @@ impl Scenario {
             if is_set {
                 return Err(FieldError::new(field, "true", "must be false with clock stepped"));
             }
+        }
+        if self.models.device != ComputeDevice::Cpu {
+            let rule = "must be cpu with clock stepped, whose results are the same bytes on any machine";
+            return Err(FieldError::new("models.device", "cuda", rule));
         }
         if self.record.is_some() {
             let rule = "must be left out with clock stepped, whose processes publish nothing";

@@ -181,6 +181,11 @@ mod tests {
                 "scene: {dir: .}\nclock: stepped\nstepped: {compute: {pose_ms: -1, map_ms: 0, fuse_ms: 0}}",
                 "pose_ms is -1",
             ),
+            ("scene: {dir: .}\nmodels: {weights: s.yaml, threads: 0}", "models.threads is 0: must be 1 to 256"),
+            (
+                "scene: {dir: .}\nclock: stepped\nmodels: {weights: s.yaml, device: cuda}",
+                "models.device is cuda: must be cpu with clock stepped",
+            ),
             ("scene: {dir: .}\nmodels: {weights: none.safetensors}", "none.safetensors does not exist"),
         ] {
             let models = if line.contains("models") { "" } else { "models: {weights: s.yaml}\n" };

@@ -13,7 +13,7 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::Serialize;
 use support::statistics;
-use tch::{Kind, Tensor, no_grad};
+use tch::{Device, Kind, Tensor, no_grad};
 
 use ego_fuser::ego::{Ego, EgoError};
 use fusion::method::Method;
@@ -78,8 +78,8 @@ impl AlignmentMeter {
     /// [`EgoError`] names the file and what is wrong with it.
     pub fn load(weights: &Weights) -> Result<Self, EgoError> {
         let method = weights.metadata(METHOD_KEY).unwrap_or(Method::NONE.name()).parse()?;
-        let detector = Detector::from_weights(weights, &weights.config()?)?;
-        let fusion = FusionStage::from_weights(weights, method, detector.config())?;
+        let detector = Detector::from_weights(weights, &weights.config()?, Device::Cpu)?;
+        let fusion = FusionStage::from_weights(weights, method, detector.config(), Device::Cpu)?;
         Ok(Self { detector, fusion })
     }
 

@@ -31,6 +31,7 @@ use perception::model_config::DetectorConfig;
 use perception::weights::Weights;
 use protocol::message::{Detections, FusedNeighbour, SkippedNeighbour};
 use protocol::{Box3d, CavId, CodecConfig, Ledger, PoseEstimate, Stamp};
+use tch::Device;
 
 use ego_fuser::ego::{Ego, EgoOutput, Skipped, View};
 use ego_fuser::misbehaviour::{MisbehaviourConfig, neighbour_states};
@@ -121,7 +122,8 @@ impl Evaluator {
     /// [`EvaluateError`] names the file and what is wrong with it.
     pub fn new(config: EvaluateConfig) -> Result<Self, EvaluateError> {
         let weights = Weights::load(&config.weights)?.with_precision(config.precision);
-        let ego = Ego::from_weights(&weights, config.method)?.with_misbehaviour_detection(config.trust)?;
+        let ego = Ego::from_weights(&weights, config.method, Device::Cpu)?;
+        let ego = ego.with_misbehaviour_detection(config.trust)?;
         let area = ego.detector().config();
         let rule = config
             .protocol
@@ -252,13 +254,13 @@ impl Evaluator {
         };
         // Messages of the ego's own vehicle are not transmitted on the link.
         let rate = if is_ego { RateConfig::default() } else { own.map_or(self.config.rate, |own| own.rate) };
-        let detector = Detector::from_weights(&self.weights, &self.weights.config()?)?;
+        let detector = Detector::from_weights(&self.weights, &self.weights.config()?, Device::Cpu)?;
         let place = scenario.agents.iter().position(|agent| agent == cav).unwrap_or(0);
         let attack = match own.and_then(|own| own.falsification) {
             Some(falsification) => Some(Attack::new(falsification, cav, 0)),
             None => self.config.attack.and_then(|attack| attack.of(place, cav)),
         };
-        let inference = Inference { precision: self.config.precision, ..Inference::default() };
+        let inference = Inference::new(Device::Cpu, self.config.precision);
         let agent = Agent::new(cav.clone(), source.for_scenario(&scenario.name).build(inference)?, detector);
         Ok(Participant::new(agent.within(rate), attack))
     }

@@ -7,6 +7,7 @@ use dataset::{LoadOptions, Scenario};
 use perception::detector::Detector;
 use perception::int8::{ActivationScales, InferencePrecision, ScaleSearch};
 use perception::weights::Weights;
+use tch::Device;
 
 use crate::evaluation::{EvaluateConfig, EvaluateError, Evaluator};
 
@@ -43,7 +44,7 @@ fn observe_detector(
     search: &mut ScaleSearch,
 ) -> Result<(), EvaluateError> {
     let weights = Weights::load(weights)?.with_precision(InferencePrecision::Float);
-    let mut detector = Detector::from_weights(&weights, &weights.config()?)?;
+    let mut detector = Detector::from_weights(&weights, &weights.config()?, Device::Cpu)?;
     for scenario in scenarios {
         for tick in 0..scenario.ticks.len().min(frames) {
             let loaded = scenario.load_tick(tick, 0..scenario.agents.len(), &LoadOptions::default());

@@ -28,7 +28,9 @@ impl Arguments {
         let EgoConfig { run, models, method, ego: settings, bus, .. } = &config;
         let cav = settings.id.as_ref().context("the configuration names no ego")?;
         models.threads.apply();
-        let ego = models.load().map_err(EgoError::from).and_then(|weights| Ego::from_weights(&weights, *method));
+        let inference = models.inference().map_err(BadInput::of)?;
+        let ego = models.load(inference).map_err(EgoError::from);
+        let ego = ego.and_then(|weights| Ego::from_weights(&weights, *method, inference.device));
         let ego = ego.map_err(|error| BadInput::new(format!("weights: {error}")))?;
         let ego = ego.with_comm_range(config.comm_range_m).with_misbehaviour_detection(settings.trust())?;
         let stop = bus.stop().context("installing signal handlers")?;

@@ -20,7 +20,7 @@ use protocol::{
     BevFeatures, CavId, CodecConfig, Dtype, Header, Limits, NoPoseReason, PoseEstimate, Stamp, WIRE_VERSION, WireError,
     wire,
 };
-use tch::{TchError, Tensor};
+use tch::{Device, TchError, Tensor};
 
 /// Digits of each hash in the name of a file.
 const HASH_DIGITS: usize = 12;
@@ -150,7 +150,7 @@ impl FeatureStore {
         if stored == all || self.bytes() >= limit_bytes {
             return Ok(());
         }
-        let mut detector = Detector::from_weights(weights, &weights.config()?)?;
+        let mut detector = Detector::from_weights(weights, &weights.config()?, Device::Cpu)?;
         for (index, scenario) in scenarios.iter().enumerate() {
             for sweep in 0..self.first[index + 1] - self.first[index] {
                 if self.first[index] + sweep < stored {
@@ -306,7 +306,7 @@ impl MapSource {
             Some(encoder) => encoder,
             None => {
                 let config = self.weights.config()?;
-                self.encoder.insert(Detector::from_weights(&self.weights, &config)?)
+                self.encoder.insert(Detector::from_weights(&self.weights, &config, Device::Cpu)?)
             }
         };
         Ok(encoder.encode(&frame.points)?.features)

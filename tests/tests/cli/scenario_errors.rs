@@ -5,6 +5,7 @@ use std::net::TcpListener;
 use std::path::Path;
 use std::process::Command;
 
+use tch::Cuda;
 use tests::fleet::{programs, write_scenario};
 use tests::locks::exclusive_lock;
 
@@ -108,6 +109,29 @@ fn a_missing_program_is_named() {
         stderr.contains(&folder.path().join("agent").display().to_string()) && stderr.contains("is missing"),
         "{stderr}"
     );
+}
+
+#[test]
+fn a_device_that_is_missing_is_named_before_anything_starts() {
+    if Cuda::is_available() {
+        return;
+    }
+    let (folder, missing) =
+        (tempfile::tempdir().unwrap(), "models.device is cuda: this libtorch is built without CUDA");
+    let scenario = write_scenario(folder.path(), 1, "", "");
+    let text = fs::read_to_string(&scenario).unwrap();
+    fs::write(&scenario, text.replace("weights.safetensors", "weights.safetensors, device: cuda")).unwrap();
+    let (code, stderr) = refused(folder.path(), &scenario);
+    assert_eq!(code, Some(2), "{stderr}");
+    assert!(stderr.contains("scenario.yaml") && stderr.contains(missing), "{stderr}");
+    assert!(!folder.path().join("runs/test").exists());
+    for [program, vehicle] in [["agent", "--cav"], ["ego-fuser", "--ego"]] {
+        let mut command = Command::new(programs().join(program));
+        command.args(["run", "--run", "test", vehicle, "1", "--weights", "w", "--device", "cuda"]);
+        let output = command.output().unwrap();
+        assert_eq!(output.status.code(), Some(2), "{program}");
+        assert!(String::from_utf8_lossy(&output.stderr).contains(missing), "{program}");
+    }
 }
 
 #[test]

@@ -65,14 +65,14 @@ fn weights_file(folder: &Path, compress_ratio: Option<i64>) -> PathBuf {
 }
 
 fn agent(name: &str, weights: &Path) -> Agent {
-    Agent::new(cav(name), Box::new(RecordedPose), Detector::load(weights).unwrap())
+    Agent::new(cav(name), Box::new(RecordedPose), Detector::load(weights, Device::Cpu).unwrap())
 }
 
 /// Without any network: boxes of every tick, and the bytes of a neighbour's feature map.
 fn offline(folder: &Path, weights: &Path) -> (Vec<Vec<Detection>>, u64) {
     let scenario = dataset::open(folder).unwrap().scenarios.remove(0);
     let mut agents = AGENTS.map(|name| agent(name, weights));
-    let mut ego = Ego::load(weights, None).unwrap();
+    let mut ego = Ego::load(weights, None, Device::Cpu).unwrap();
     let (mut results, mut bytes) = (Vec::new(), 0);
     for tick in 0..scenario.ticks.len() {
         let views: Vec<View> = (agents.iter_mut().enumerate())
@@ -115,7 +115,7 @@ fn live(folder: &Path, weights: &Path, of_neighbour: &Path) -> (Vec<Detections>,
                 bus.leave(TIMEOUT).unwrap();
             });
         }
-        let (own_stop, ego) = (stop.clone(), Ego::load(weights, None).unwrap());
+        let (own_stop, ego) = (stop.clone(), Ego::load(weights, None, Device::Cpu).unwrap());
         let router = &router;
         let ego = scope.spawn(move || {
             let bus = router.join("ego-10", "10");

@@ -39,11 +39,11 @@ use zenoh::Wait;
 const AGENTS: [&str; 3] = ["10", "20", "30"];
 const TICKS: usize = 6;
 
-fn cav(text: &str) -> CavId {
+pub(super) fn cav(text: &str) -> CavId {
     CavId::new(text).unwrap()
 }
 
-fn topic(cav_id: &str, stream: Stream) -> Topic {
+pub(super) fn topic(cav_id: &str, stream: Stream) -> Topic {
     Topic::Stream { cav: cav(cav_id), stream }
 }
 
@@ -69,11 +69,11 @@ fn detector() -> Detector {
 }
 
 /// An ego around the same network, its fusion with the same random parameters every time.
-fn ego(method: Method) -> Ego {
+pub(super) fn ego(method: Method) -> Ego {
     seeded(|| Ego::new(network(), method).unwrap())
 }
 
-fn agent(cav_id: &str) -> Agent {
+pub(super) fn agent(cav_id: &str) -> Agent {
     Agent::new(cav(cav_id), Box::new(RecordedPose), detector())
 }
 

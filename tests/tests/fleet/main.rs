@@ -4,5 +4,6 @@ mod compressor;
 mod in_process;
 mod live_figures;
 mod localization;
+mod pace;
 mod processes;
 mod simulation_time;

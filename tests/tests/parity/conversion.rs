@@ -95,7 +95,7 @@ fn golden_converted_where2comm_of_one_scale_runs_live() {
     let fusion: FusionConfig = weights.metadata_json("fusion").unwrap();
     let expected = Where2commConfig { aggregation: where2comm::Aggregation::Attention, missing: Missing::Zero };
     assert_eq!(fusion, FusionConfig::new(expected));
-    assert_eq!(Ego::load(&path, None).unwrap().method(), Method::WHERE2COMM);
+    assert_eq!(Ego::load(&path, None, Device::Cpu).unwrap().method(), Method::WHERE2COMM);
 }
 
 /// Two vehicles with overlapping views of the same street.
@@ -254,7 +254,7 @@ fn fusions_with_parameters_come_back_with_every_one() {
         for (name, found) in model.variables.variables() {
             assert!(name == "steering.weight" || found.equal(&variables[&name]), "{method}: {name}");
         }
-        let ego = Ego::load(&path, None).unwrap();
+        let ego = Ego::load(&path, None, Device::Cpu).unwrap();
         let (sent, code_of) = (ego.detector().sent_shape(), ego.detector().code_of());
         assert_eq!((ego.method(), sent, code_of), (method, [4, 8, 16], Some(16)));
     }

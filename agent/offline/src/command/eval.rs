@@ -19,15 +19,14 @@ use localization::pose_source::{PoseSource, TrackedPose, TrackedPoseConfig};
 use localization::registration::icp::IcpConfig;
 use localization::registration::ransac::RansacConfig;
 use localization::registration::sc2pcr::Sc2PcrConfig;
+use perception::compute_device::ComputeDevice;
 use perception::inference::Inference;
 use perception::int8::InferencePrecision;
-use perception::train::cuda_device;
 use perception::weights::annotate;
 use protocol::config::Section;
 use serde_json::json;
 use support::output;
 use support::progress;
-use tch::Device;
 
 use super::scene_heads::{SceneHeadFile, by_head};
 use support::cli::{BadInput, Outcome};
@@ -105,8 +104,8 @@ pub(crate) struct Args {
     #[arg(long, value_name = "FILE")]
     error_table: Option<PathBuf>,
     /// Device to compute on.
-    #[arg(long, value_enum, default_value_t = ComputeOn::Cpu)]
-    device: ComputeOn,
+    #[arg(long, value_enum, default_value_t)]
+    device: ComputeDevice,
     /// Number format in which networks are computed.
     #[arg(long, value_enum, default_value_t)]
     precision: InferencePrecision,
@@ -124,14 +123,6 @@ enum Search {
     Ransac,
     /// Second-order spatial compatibility.
     Sc2pcr,
-}
-
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-enum ComputeOn {
-    /// The CPU.
-    Cpu,
-    /// The first CUDA device.
-    Cuda,
 }
 
 /// Method under evaluation.
@@ -194,11 +185,8 @@ impl Args {
     }
 
     fn inference(&self) -> Result<Inference, BadInput> {
-        let device = match self.device {
-            ComputeOn::Cpu => Device::Cpu,
-            ComputeOn::Cuda => cuda_device().map_err(BadInput::of)?,
-        };
-        Ok(Inference { device, precision: self.precision })
+        let device = self.device.open().map_err(|missing| BadInput::new(format!("--device cuda: {missing}")))?;
+        Ok(Inference::new(device, self.precision))
     }
 
     fn tracking(&self, head: &Path) -> Result<Subject, BadInput> {

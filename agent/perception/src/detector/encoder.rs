@@ -1,6 +1,6 @@
 //! Canvas, backbone and shrink of a detector, in floating point or in 8-bit integers.
 
-use tch::{TchError, Tensor};
+use tch::{Device, TchError, Tensor};
 
 use super::int8_backbone::{CANVAS, Int8Backbone, observe_backbone};
 use crate::int8::{ActivationScales, Quantisation, QuantiseError, ScaleSearch};
@@ -15,6 +15,8 @@ use crate::pillars::voxels::Pillars;
 pub(super) struct BevEncoder {
     pillar_grid: PillarGrid,
     projection: PillarProjection,
+    /// Of the layers.
+    device: Device,
     layers: Layers,
 }
 
@@ -35,9 +37,10 @@ impl BevEncoder {
         projection: PillarProjection,
         backbone: BevBackbone,
         shrink: Option<Shrink>,
+        device: Device,
     ) -> Self {
         let canvas = vec![0.0; canvas_len(&pillar_grid, &projection)];
-        Self { pillar_grid, projection, layers: Layers::Float { canvas, backbone, shrink } }
+        Self { pillar_grid, projection, device, layers: Layers::Float { canvas, backbone, shrink } }
     }
 
     /// The same in integers, if its layers can be quantised.
@@ -51,7 +54,7 @@ impl BevEncoder {
 
     /// Writes pillars to the canvas.
     pub(super) fn scatter(&mut self, pillars: &Pillars) -> Result<Canvas, TchError> {
-        let Self { pillar_grid, projection, layers } = self;
+        let Self { pillar_grid, projection, device, layers } = self;
         let flat = match layers {
             Layers::Float { canvas, .. } => {
                 canvas.fill(0.0);
@@ -65,7 +68,8 @@ impl BevEncoder {
             }
         };
         let [height, width] = [pillar_grid.height, pillar_grid.width].map(|size| size as i64);
-        Ok(Canvas(flat?.f_view([1, height, width, -1])?.f_permute([0, 3, 1, 2])?))
+        let canvas = flat?.f_view([1, height, width, -1])?.f_to_device(*device)?;
+        Ok(Canvas(canvas.f_permute([0, 3, 1, 2])?))
     }
 
     /// Feature map `[1, C, H', W']` of a canvas, contiguous.

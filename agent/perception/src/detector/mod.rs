@@ -33,12 +33,17 @@ use crate::weights::Weights;
 
 /// A trained PointPillars network in its fastest form, for one sweep at a time.
 ///
+/// Crop, voxels and the features of pillars are computed on the CPU in plain floats, and so are decoding and suppression
+/// of boxes; convolutions and heads run on [`Self::device`]. Feature maps stay there; messages and [`Heads`] are copied
+/// from it. CUDA computes asynchronously: the time of its convolutions is part of the copy of their result.
+///
 /// The same sweep gives the same bits in any process, as long as the number of torch threads is the same
 /// (`tch::set_num_threads`; live and offline runs use 1).
 #[derive(Debug)]
 pub struct Detector {
     config: DetectorConfig,
     sha256: String,
+    device: Device,
     crop: Crop,
     voxeliser: Voxeliser,
     encoder: BevEncoder,
@@ -49,28 +54,30 @@ pub struct Detector {
 }
 
 impl Detector {
-    /// Reads a weights file, configuration included.
+    /// Reads a weights file, configuration included, to compute on `device`.
     ///
     /// # Errors
     /// [`DetectorError`] names the file, the tensor and both shapes.
-    pub fn load(path: &Path) -> Result<Self, DetectorError> {
+    pub fn load(path: &Path, device: Device) -> Result<Self, DetectorError> {
         let weights = Weights::load(path)?;
-        Self::from_weights(&weights, &weights.config()?)
+        Self::from_weights(&weights, &weights.config()?, device)
     }
 
-    /// Builds the detector that `config` describes from a file already read, in integers if it has scales of
-    /// activations.
+    /// Builds the detector that `config` describes from a file already read; on the CPU in integers if it has
+    /// scales of activations.
     ///
     /// # Errors
     /// See [`Self::load`].
-    pub fn from_weights(weights: &Weights, config: &DetectorConfig) -> Result<Self, DetectorError> {
-        let network = VarStore::new(Device::Cpu);
+    pub fn from_weights(weights: &Weights, config: &DetectorConfig, device: Device) -> Result<Self, DetectorError> {
+        let network = VarStore::new(device);
         let pillars = PointPillars::new(&network.root(), config)?;
         weights.copy_into(&network)?;
         let detector = Self { sha256: weights.sha256().to_owned(), ..Self::from_network(pillars) };
         match weights.activation_scales()? {
-            Some(scales) => Ok(detector.quantised(&scales).map_err(|error| weights.quantise_error(error))?),
-            None => Ok(detector),
+            Some(scales) if device == Device::Cpu => {
+                Ok(detector.quantised(&scales).map_err(|error| weights.quantise_error(error))?)
+            }
+            _ => Ok(detector),
         }
     }
 
@@ -82,11 +89,12 @@ impl Detector {
         Ok(Self { encoder: self.encoder.quantised(scales)?, ..self })
     }
 
-    /// Uses a network on the CPU, trained or not; its norms are folded into the convolutions.
+    /// Uses a network, trained or not, on its device; its norms are folded into the convolutions.
     #[must_use]
     pub fn from_network(network: PointPillars) -> Self {
         tch::no_grad(|| Self {
             sha256: String::new(),
+            device: network.device(),
             crop: Crop::for_detector(&network.config),
             voxeliser: Voxeliser::for_detector(&network.config),
             encoder: BevEncoder::new(
@@ -94,6 +102,7 @@ impl Detector {
                 PillarProjection::new(&network.encoder),
                 network.backbone.folded(),
                 network.shrink.as_ref().map(Shrink::folded),
+                network.device(),
             ),
             compressor: network.compressor.as_ref().map(Compressor::folded),
             anchors: Anchors::for_detector(&network.config),
@@ -107,6 +116,12 @@ impl Detector {
     #[must_use]
     pub fn config(&self) -> &DetectorConfig {
         &self.config
+    }
+
+    /// Device of its feature maps.
+    #[must_use]
+    pub fn device(&self) -> Device {
+        self.device
     }
 
     /// SHA-256 of its weights file; empty if it was not read from one.
@@ -258,12 +273,13 @@ impl Detector {
                 expected: self.sent_shape(),
             });
         }
-        let decompressed = self.decompressed(&Tensor::f_from_slice(values)?.f_view([1, expected, height, width])?)?;
+        let values = Tensor::f_from_slice(values)?.f_view([1, expected, height, width])?;
+        let decompressed = self.decompressed(&values.f_to_device(self.device)?)?;
         match (sent, &self.compressor) {
             // The expansion spreads the sent cells to their neighbours, and the bias everywhere.
             (Some(sent), Some(_)) => {
                 let sent = Tensor::f_from_slice(sent)?.f_to_kind(Kind::Float)?.f_view([1, 1, height, width])?;
-                Ok(decompressed.f_mul(&sent)?)
+                Ok(decompressed.f_mul(&sent.f_to_device(self.device)?)?)
             }
             _ => Ok(decompressed),
         }
@@ -383,12 +399,12 @@ mod tests {
         let metadata: BTreeMap<_, _> =
             [(CONFIG_KEY, config), (SCALES_KEY, scales)].map(|(key, value)| (key.to_owned(), value)).into();
         weights::save(&path, &store, &metadata, Precision::Single).unwrap();
-        let found = Detector::load(&path).unwrap().encode(&cloud).unwrap().features;
+        let found = Detector::load(&path, Device::Cpu).unwrap().encode(&cloud).unwrap().features;
         let error = (&found - &expected).square().mean(Kind::Float).sqrt().double_value(&[]);
         assert!(found.is_contiguous() && error > 0.0, "{error}");
         assert!(error < 0.06 * expected.std(true).double_value(&[]), "{error}");
         let weights = Weights::load(&path).unwrap().with_precision(InferencePrecision::Float);
-        let mut again = Detector::from_weights(&weights, &weights.config().unwrap()).unwrap();
+        let mut again = Detector::from_weights(&weights, &weights.config().unwrap(), Device::Cpu).unwrap();
         assert!(again.encode(&cloud).unwrap().features.equal(&expected));
     }
 
@@ -401,7 +417,7 @@ mod tests {
         let metadata: BTreeMap<_, _> =
             [(CONFIG_KEY, config), (SCALES_KEY, "{}".to_owned())].map(|(key, value)| (key.to_owned(), value)).into();
         weights::save(&path, &store, &metadata, Precision::Single).unwrap();
-        let message = Detector::load(&path).unwrap_err().to_string();
+        let message = Detector::load(&path, Device::Cpu).unwrap_err().to_string();
         assert!(message.contains("w.safetensors") && message.contains("pillar_vfe.canvas"), "{message}");
     }
 
@@ -515,7 +531,7 @@ mod tests {
         let path = folder.path().join("lean.safetensors");
         let metadata: BTreeMap<_, _> = [(CONFIG_KEY.to_owned(), serde_json::to_string(&config()).unwrap())].into();
         let sha256 = weights::save(&path, &store, &metadata, Precision::Single).unwrap();
-        let mut loaded = Detector::load(&path).unwrap();
+        let mut loaded = Detector::load(&path, Device::Cpu).unwrap();
         assert_eq!((loaded.sha256(), loaded.config()), (sha256.as_str(), &config()));
         let mut original = Detector::from_network(pillars);
         assert!(loaded.encode(&cloud()).unwrap().features.equal(&original.encode(&cloud()).unwrap().features));

@@ -45,7 +45,7 @@ impl Heads {
     }
 }
 
-/// The values of a tensor in row-major order.
+/// The values of a tensor on any device, in row-major order.
 pub(super) fn flat(tensor: &Tensor) -> Result<Vec<f32>, TchError> {
     Vec::try_from(&tensor.f_contiguous()?.f_view([-1])?)
 }

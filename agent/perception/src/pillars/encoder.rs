@@ -1,6 +1,6 @@
 //! Pillar feature network: from ten values per point to one feature vector per pillar.
 
-use tch::{Tensor, nn};
+use tch::{Device, Tensor, nn};
 
 use crate::layers::convolution::Norm;
 use crate::pillars::batch::{POINT_FEATURES, PillarBatch};
@@ -36,6 +36,12 @@ impl PillarEncoder {
         let best = segment_max(&rows.narrow(0, 0, points), &batch.counts);
         let floor = rows.narrow(0, points, 1);
         best.maximum(&floor).where_self(&batch.partial, &best)
+    }
+
+    /// Device of its parameters.
+    #[must_use]
+    pub fn device(&self) -> Device {
+        self.linear.device()
     }
 
     /// The linear layer with the running statistics folded in: weight `[C, 10]`, bias `[C]`.

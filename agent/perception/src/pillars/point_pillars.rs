@@ -1,6 +1,6 @@
 //! PointPillars network, for training and for inference.
 
-use tch::{Kind, TchError, Tensor, nn};
+use tch::{Device, Kind, TchError, Tensor, nn};
 
 use crate::layers::backbone::BevBackbone;
 use crate::layers::head::{DetectionHead, HeadOutput};
@@ -50,6 +50,12 @@ impl PointPillars {
             head: DetectionHead::new(path, channels, config.anchors.yaws_deg.len() as i64),
             config: config.clone(),
         })
+    }
+
+    /// Device of its parameters.
+    #[must_use]
+    pub fn device(&self) -> Device {
+        self.encoder.device()
     }
 
     /// Grid of the pillars on the canvas.

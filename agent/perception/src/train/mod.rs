@@ -21,7 +21,7 @@ pub use checkpoint::CheckpointError;
 pub use curve::Curve;
 pub use data_listing::DataListing;
 pub use error::TrainingError;
-pub use options::{OptionsError, TrainingOptions, cuda_device};
+pub use options::{OptionsError, TrainingOptions};
 pub use prefetch::Prefetch;
 pub use run_config::{ComputePrecision, Length, RunConfig};
 pub use schedule::OneCycle;

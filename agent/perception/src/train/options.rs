@@ -4,12 +4,12 @@ use std::io;
 use std::path::PathBuf;
 use std::time::Duration;
 
-use clap::ValueEnum;
 use support::output;
-use tch::{Cuda, Device};
+use tch::Device;
 
 use super::run_config::{ComputePrecision, Length, RunConfig};
 use super::trainer::Trained;
+use crate::compute_device::{ComputeDevice, NoCuda};
 
 /// Options that are invalid for any training.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -24,8 +24,8 @@ pub enum OptionsError {
     #[error("{}: it already holds a training; --resume continues it, --force overwrites it", .0.display())]
     Trained(PathBuf),
     /// There is no CUDA device.
-    #[error("no CUDA device, or a libtorch without CUDA")]
-    NoCuda,
+    #[error("--device cuda: {0}")]
+    NoCuda(#[from] NoCuda),
 }
 
 /// Options of length, device, precision and results.
@@ -44,8 +44,8 @@ pub struct TrainingOptions {
     #[arg(long, default_value_t = 0)]
     seed: u64,
     /// Device to compute on.
-    #[arg(long, value_enum, default_value_t = DeviceName::Cpu)]
-    device: DeviceName,
+    #[arg(long, value_enum, default_value_t)]
+    device: ComputeDevice,
     /// Threads of the network on the CPU.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=256))]
     threads: u16,
@@ -69,14 +69,6 @@ pub struct TrainingOptions {
     json: bool,
 }
 
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-enum DeviceName {
-    /// The CPU.
-    Cpu,
-    /// The first CUDA device.
-    Cuda,
-}
-
 impl TrainingOptions {
     /// The configuration of a training; also sets the tensor library's number of threads. Prints a line to standard
     /// error if the CPU does not support the requested precision.
@@ -89,7 +81,7 @@ impl TrainingOptions {
         }
         self.check_out()?;
         tch::set_num_threads(i32::from(self.threads));
-        let device = self.device()?;
+        let device = self.device.open()?;
         Ok(RunConfig {
             batch,
             learning_rate,
@@ -150,13 +142,6 @@ impl TrainingOptions {
             _ => Err(OptionsError::Length),
         }
     }
-
-    fn device(&self) -> Result<Device, OptionsError> {
-        match self.device {
-            DeviceName::Cpu => Ok(Device::Cpu),
-            DeviceName::Cuda => cuda_device(),
-        }
-    }
 }
 
 /// True if the CPU multiplies in bfloat16 natively.
@@ -167,14 +152,6 @@ fn has_bfloat16() -> bool {
     return std::arch::is_aarch64_feature_detected!("bf16");
     #[cfg(not(any(target_arch = "x86_64", target_arch = "aarch64")))]
     false
-}
-
-/// The first CUDA device; without this check the tensor library panics if there is none.
-///
-/// # Errors
-/// [`OptionsError::NoCuda`] when there is none, or the tensor library was built without CUDA.
-pub fn cuda_device() -> Result<Device, OptionsError> {
-    if Cuda::is_available() { Ok(Device::Cuda(0)) } else { Err(OptionsError::NoCuda) }
 }
 
 #[cfg(test)]

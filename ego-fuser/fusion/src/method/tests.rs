@@ -196,7 +196,7 @@ fn a_method_from_outside_the_table_runs_through_the_pipeline() {
     let detector = DetectorConfig::lean();
     let config = method.default_fusion(&detector);
     assert_eq!(config.settings::<mean::MeanConfig>().map(|settings| settings.gain), Some(2.0));
-    let stage = FusionStage::untrained(method, &detector).unwrap();
+    let stage = FusionStage::untrained(method, &detector, Device::Cpu).unwrap();
     let grid = detector.feature_grid();
     let size = [2, detector.feature_channels(), i64::from(grid.height), i64::from(grid.width)];
     let maps = Tensor::rand(size, FLOAT);

@@ -36,6 +36,9 @@ pub enum StageError {
 }
 
 /// Channel mixing, warp and fusion of one network.
+///
+/// Everything runs on the device of its maps. Maps on the CPU that need no gradient are read and fused in plain floats in
+/// places, which is faster there.
 #[derive(Debug)]
 pub struct FusionStage {
     config: FusionConfig,
@@ -74,31 +77,37 @@ impl FusionStage {
         Ok(Self { config: config.clone(), requirements, fusion, mixing, classes, grid, y_axis, search: None })
     }
 
-    /// The fusion of a weights file, or the one of `method` where it differs and has no parameters.
+    /// The fusion of a weights file, or the one of `method` where it differs and has no parameters; it takes maps on
+    /// `device`.
     ///
     /// # Errors
     /// [`StageError`] names the file and the first parameter that is missing or of another shape.
-    pub fn from_weights(weights: &Weights, method: Method, detector: &DetectorConfig) -> Result<Self, StageError> {
-        let variables = VarStore::new(Device::Cpu);
+    pub fn from_weights(
+        weights: &Weights,
+        method: Method,
+        detector: &DetectorConfig,
+        device: Device,
+    ) -> Result<Self, StageError> {
+        let variables = VarStore::new(device);
         let config = stored_config(weights, method, detector)?;
         let mut stage = Self::new(&variables.root(), &config, method, detector)?;
         weights.copy_some_into(&variables, |name| name != channel_mixing::WEIGHT || weights.contains(name))?;
         if !weights.contains(channel_mixing::WEIGHT) {
             stage.mixing = None;
         }
-        if let Some(scales) = weights.activation_scales()? {
+        if let Some(scales) = weights.activation_scales()?.filter(|_| device == Device::Cpu) {
             tch::no_grad(|| stage.fusion.quantise(&scales)).map_err(|error| weights.quantise_error(error))?;
         }
         Ok(stage)
     }
 
-    /// The fusion of `method` behind a network without fusion weights: its parameters are random, channels are not
-    /// mixed.
+    /// The fusion of `method` behind a network without fusion weights, for maps on `device`: its parameters are random,
+    /// channels are not mixed.
     ///
     /// # Errors
     /// [`ConfigError`] names the field that no fusion can be built from.
-    pub fn untrained(method: Method, detector: &DetectorConfig) -> Result<Self, ConfigError> {
-        let variables = VarStore::new(Device::Cpu);
+    pub fn untrained(method: Method, detector: &DetectorConfig, device: Device) -> Result<Self, ConfigError> {
+        let variables = VarStore::new(device);
         let config = method.default_fusion(detector);
         Ok(Self { mixing: None, ..Self::new(&variables.root(), &config, method, detector)? })
     }
@@ -337,7 +346,7 @@ mod tests {
             [Pose::IDENTITY, Pose::from_xyz_yaw([8.0, 3.0, 0.0], 0.4), Pose::from_xyz_yaw([-5.0, 9.0, 0.0], -2.0)];
         let facts: Vec<MapMetadata> = (0..3).map(|agent| MapMetadata::fresh(agent, poses[agent])).collect();
         let fused = |detector: &DetectorConfig, maps: &Tensor| {
-            let stage = FusionStage::untrained(Method::ATTENTION, detector).unwrap();
+            let stage = FusionStage::untrained(Method::ATTENTION, detector, Device::Cpu).unwrap();
             let received = ReceivedMaps::new(maps.shallow_clone(), None);
             stage.fuse(&stage.align(&received, &facts).unwrap()).unwrap().map
         };

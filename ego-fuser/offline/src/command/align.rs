@@ -20,6 +20,7 @@ use perception::inference::Inference;
 use protocol::CavId;
 use support::output;
 use support::progress;
+use tch::Device;
 
 use super::scenarios;
 use support::cli::BadInput;
@@ -168,7 +169,7 @@ impl Arguments {
         let Some(weights) = &self.weights else {
             return Err(BadInput::new("detected boxes need --weights FILE; or use --boxes annotated").into());
         };
-        let detector = Detector::load(weights).map_err(BadInput::of)?;
+        let detector = Detector::load(weights, Device::Cpu).map_err(BadInput::of)?;
         let cav = CavId::new("detector").context("a name")?;
         Ok(BoxSource::Detected(Box::new(Agent::new(cav, Box::new(RecordedPose), detector))))
     }
