@@ -322,7 +322,7 @@ mod tests {
             let found = encoder.encode(&batch, Kind::Float).unwrap();
             for (found, expected) in [(found.cells, expected.cells), (found.sweeps, expected.sweeps)] {
                 let error = (&found - &expected).square().mean(Kind::Float).sqrt().double_value(&[]);
-                assert!(error > 0.0 && error < 0.05 * expected.std(true).double_value(&[]), "{error}");
+                assert!(error > 0.0 && error < 0.1 * expected.std(true).double_value(&[]), "{error}");
             }
         }
     }
