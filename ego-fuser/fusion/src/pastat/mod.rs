@@ -128,7 +128,10 @@ impl Fusion for Pastat {
     fn fuse(&self, maps: &AlignedMaps) -> Result<FusionOutput, TchError> {
         let (fused, corrections) = self.unrefined(maps)?;
         let refined = match &self.map_refinement {
-            Some(refinement) => refinement.forward(&fused, maps.is_training)?,
+            Some(refinement) => {
+                let likely = likely(&fused, maps)?;
+                refinement.forward(fused, likely.as_ref(), maps.is_training)?
+            }
             None => fused,
         };
         Ok(FusionOutput { map: refined.f_squeeze_dim(0)?.f_to_kind(maps.warped.features.kind())?, corrections })
@@ -144,6 +147,13 @@ impl Fusion for Pastat {
     fn quantise(&mut self, scales: &ActivationScales) -> Result<(), QuantiseError> {
         self.map_refinement.as_mut().map_or(Ok(()), |refinement| refinement.quantise(scales))
     }
+}
+
+/// Likelihood of a vehicle by the detector's class head, `[1, 1, H, W]`; `None` before there are earlier maps, with
+/// which the head comes.
+fn likely(fused: &Tensor, maps: &AlignedMaps) -> Result<Option<Tensor>, TchError> {
+    let full_resolution = maps.earlier.as_ref().and_then(|earlier| earlier.full_resolution.as_ref());
+    full_resolution.map(|(_, classes)| classes.likely(fused)).transpose()
 }
 
 /// `[1, C, H, W]` without the padding, given maps without padding.
