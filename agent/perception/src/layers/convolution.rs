@@ -255,20 +255,6 @@ pub fn channels_last(x: &Tensor) -> Tensor {
     x.permute([0, 2, 3, 1]).contiguous().permute([0, 3, 1, 2])
 }
 
-/// [`channels_last`] of one contiguous map `[1, C, H, W]`, by one transposition like [`contiguous_map`].
-///
-/// # Errors
-/// Those of the tensor library.
-pub fn channels_last_map(map: &Tensor) -> Result<Tensor, TchError> {
-    let (batch, channels, height, width) = map.size4()?;
-    let cells = map.f_permute([0, 2, 3, 1])?;
-    if batch != 1 || !map.is_contiguous() {
-        return cells.f_contiguous()?.f_permute([0, 3, 1, 2]);
-    }
-    let cells = map.f_view([channels, height * width])?.f_tr()?.f_contiguous()?;
-    cells.f_view([1, height, width, channels])?.f_permute([0, 3, 1, 2])
-}
-
 #[cfg(test)]
 mod tests {
     use tch::nn::VarStore;
