@@ -163,13 +163,13 @@ fn radar_sees_what_moves() {
         returns += radar.len();
         for &[x, y, z, red] in &radar.xyzi {
             assert!(x > 0.0 && (y / x).abs() < 1.9 && x.hypot(y).hypot(z) < 154.0, "{x} {y} {z}");
-            // Static objects approach at most at the speed of the vehicle.
+            // Static objects approach at most at the speed of the vehicle, which it measures with 0.2 m/s of noise.
             let own = frame.speed_mps.unwrap() as f32;
             let velocity = red_to_velocity(red);
             moving += usize::from(velocity < -own - 2.0 || velocity > 2.0);
         }
     }
-    assert!(returns > 2000 && moving > 20, "{moving} of {returns} returns are of moving vehicles");
+    assert!(returns > 2000 && moving > 10, "{moving} of {returns} returns are of moving vehicles");
 }
 
 #[test]
