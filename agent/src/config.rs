@@ -94,7 +94,7 @@ impl ModelConfig {
         Ok(Weights::load(&self.weights)?.with_precision(inference.precision))
     }
 
-    /// How networks are computed.
+    /// Device and number format of the networks.
     ///
     /// # Errors
     /// [`FieldError`] names what a device needs and this machine lacks.

@@ -113,25 +113,24 @@ fn a_missing_program_is_named() {
 
 #[test]
 fn a_device_that_is_missing_is_named_before_anything_starts() {
-    if Cuda::is_available() {
-        return;
-    }
-    let (folder, missing) =
-        (tempfile::tempdir().unwrap(), "models.device is cuda: this libtorch is built without CUDA");
-    let scenario = write_scenario(folder.path(), 1, "", "");
-    let text = fs::read_to_string(&scenario).unwrap();
-    fs::write(&scenario, text.replace("weights.safetensors", "weights.safetensors, device: cuda")).unwrap();
-    let (code, stderr) = refused(folder.path(), &scenario);
-    assert_eq!(code, Some(2), "{stderr}");
-    assert!(stderr.contains("scenario.yaml") && stderr.contains(missing), "{stderr}");
-    assert!(!folder.path().join("runs/test").exists());
+    let missing = "models.device is cuda: this libtorch is built without CUDA";
+    let is_missing = !Cuda::is_available();
+    // The weights do not exist: where there is a device, that is what is refused.
     for [program, vehicle] in [["agent", "--cav"], ["ego-fuser", "--ego"]] {
         let mut command = Command::new(programs().join(program));
         command.args(["run", "--run", "test", vehicle, "1", "--weights", "w", "--device", "cuda"]);
         let output = command.output().unwrap();
         assert_eq!(output.status.code(), Some(2), "{program}");
-        assert!(String::from_utf8_lossy(&output.stderr).contains(missing), "{program}");
+        assert_eq!(String::from_utf8_lossy(&output.stderr).contains(missing), is_missing, "{program}");
     }
+    let folder = tempfile::tempdir().unwrap();
+    let scenario = write_scenario(folder.path(), 1, "", "");
+    let text = fs::read_to_string(&scenario).unwrap();
+    fs::write(&scenario, text.replace("weights.safetensors", "missing.safetensors, device: cuda")).unwrap();
+    let (code, stderr) = refused(folder.path(), &scenario);
+    assert!(code == Some(2) && stderr.contains("scenario.yaml"), "{code:?} {stderr}");
+    assert_eq!(stderr.contains(missing), is_missing, "{stderr}");
+    assert!(!folder.path().join("runs/test").exists());
 }
 
 #[test]
