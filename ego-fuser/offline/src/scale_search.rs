@@ -3,7 +3,7 @@
 use std::ops::ControlFlow;
 use std::path::Path;
 
-use dataset::{LoadOptions, Scenario};
+use dataset::{LeftOut, LoadOptions, Scenario};
 use perception::detector::Detector;
 use perception::int8::{ActivationScales, InferencePrecision, ScaleSearch};
 use perception::weights::Weights;
@@ -12,13 +12,19 @@ use tch::Device;
 use crate::evaluation::{EvaluateConfig, EvaluateError, Evaluator};
 
 /// Scales of the activations of a weights file, computed in floating point on the first `frames` ticks of every
-/// scenario with true poses: of the detector on the sweeps of all vehicles, of the fusion on their maps.
+/// scenario with true poses: of the detector on the sweeps of all vehicles, of the fusion on their maps. Sweeps that
+/// cannot be read are counted in `left_out`.
 ///
 /// # Errors
 /// [`EvaluateError`] names the file and what is wrong with it.
-pub fn search_scales(weights: &Path, scenarios: &[Scenario], frames: usize) -> Result<ActivationScales, EvaluateError> {
+pub fn search_scales(
+    weights: &Path,
+    scenarios: &[Scenario],
+    frames: usize,
+    left_out: &mut LeftOut,
+) -> Result<ActivationScales, EvaluateError> {
     let mut search = ScaleSearch::default();
-    observe_detector(weights, scenarios, frames, &mut search)?;
+    observe_detector(weights, scenarios, frames, &mut search, left_out)?;
     let mut evaluator = Evaluator::new(EvaluateConfig {
         precision: InferencePrecision::Float,
         weights: weights.to_owned(),
@@ -42,12 +48,14 @@ fn observe_detector(
     scenarios: &[Scenario],
     frames: usize,
     search: &mut ScaleSearch,
+    left_out: &mut LeftOut,
 ) -> Result<(), EvaluateError> {
     let weights = Weights::load(weights)?.with_precision(InferencePrecision::Float);
     let mut detector = Detector::from_weights(&weights, &weights.config()?, Device::Cpu)?;
     for scenario in scenarios {
         for tick in 0..scenario.ticks.len().min(frames) {
             let loaded = scenario.load_tick(tick, 0..scenario.agents.len(), &LoadOptions::default());
+            left_out.add_tick(&loaded);
             for (_, frame) in loaded.frames {
                 detector.observe(&frame.points, search)?;
             }

@@ -26,7 +26,7 @@ enum Layers {
     Int8 { canvas: Vec<u8>, quantisation: Quantisation, backbone: Int8Backbone },
 }
 
-/// What pillars are written to, `[1, C_pillar, H, W]` with the channels innermost in memory.
+/// Canvas with the features of pillars: `[1, C_pillar, H, W]`, channels innermost in memory.
 #[derive(Debug)]
 pub(super) struct Canvas(Tensor);
 

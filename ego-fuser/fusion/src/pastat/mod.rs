@@ -149,8 +149,8 @@ impl Fusion for Pastat {
     }
 }
 
-/// Likelihood of a vehicle by the detector's class head, `[1, 1, H, W]`; `None` before there are earlier maps, with
-/// which the head comes.
+/// Likelihood of a vehicle by the detector's class head, `[1, 1, H, W]`; `None` without earlier maps, since the input
+/// contains the head together with these.
 fn likely(fused: &Tensor, maps: &AlignedMaps) -> Result<Option<Tensor>, TchError> {
     let full_resolution = maps.earlier.as_ref().and_then(|earlier| earlier.full_resolution.as_ref());
     full_resolution.map(|(_, classes)| classes.likely(fused)).transpose()

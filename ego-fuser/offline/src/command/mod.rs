@@ -36,7 +36,7 @@ impl Command {
             Self::Align(arguments) => arguments.run()?,
             Self::Eval(arguments) => return arguments.run(),
             Self::AlignmentError(arguments) => arguments.run()?,
-            Self::Quantise(arguments) => arguments.run()?,
+            Self::Quantise(arguments) => return arguments.run(),
             Self::Train(arguments) => arguments.run()?,
         }
         Ok(Outcome::Done)

@@ -3,11 +3,11 @@
 use std::path::PathBuf;
 
 use anyhow::Result;
-use dataset::IntensityScale;
+use dataset::{IntensityScale, LeftOut};
 use ego_fuser_offline::scale_search::search_scales;
 use perception::int8::SCALES_KEY;
 use perception::weights::annotate;
-use support::cli::BadInput;
+use support::cli::{BadInput, Outcome};
 use support::output;
 
 use super::scenarios;
@@ -32,11 +32,17 @@ pub(crate) struct Arguments {
 
 impl Arguments {
     /// Searches, stores and prints a line per file.
-    pub(crate) fn run(self) -> Result<()> {
+    pub(crate) fn run(self) -> Result<Outcome> {
         tch::set_num_threads(1);
         let scenarios = scenarios(&self.data, self.intensity_scale)?;
+        if scenarios.iter().all(|scenario| scenario.ticks.is_empty()) || self.frames == 0 {
+            return Err(BadInput::new("--data and --frames: no frame to search scales on").into());
+        }
+        let mut left_out = LeftOut::default();
         for path in &self.weights {
-            let scales = search_scales(path, &scenarios, self.frames).map_err(BadInput::of)?;
+            // The same sweeps for every file.
+            left_out = LeftOut::default();
+            let scales = search_scales(path, &scenarios, self.frames, &mut left_out).map_err(BadInput::of)?;
             if scales.is_empty() {
                 output::line(format_args!("{}: no layer can be quantised, unchanged", path.display()))?;
                 continue;
@@ -44,6 +50,6 @@ impl Arguments {
             let sha256 = annotate(path, SCALES_KEY, &serde_json::to_string(&scales)?).map_err(BadInput::of)?;
             output::line(format_args!("{}: {} activations, SHA-256 {sha256}", path.display(), scales.len()))?;
         }
-        Ok(())
+        Ok(left_out.print())
     }
 }
