@@ -180,6 +180,12 @@ impl KeyExpr {
         Self(format!("{KEY_ROOT}/{run}/*/{stream}"))
     }
 
+    /// The images of all cameras of every vehicle.
+    #[must_use]
+    pub fn cameras(run: &RunId) -> Self {
+        Self(format!("{KEY_ROOT}/{run}/*/camera/*"))
+    }
+
     /// One stream of every vehicle as it reaches `ego` over the link.
     #[must_use]
     pub fn received(run: &RunId, ego: &CavId, stream: Stream) -> Self {
