@@ -12,7 +12,7 @@
 //!
 //! # fn main() -> Result<(), Box<dyn std::error::Error>> {
 //! let dir = std::env::temp_dir().join(format!("v2vloc-drive-{}", std::process::id()));
-//! generate(&SynthOptions { frames: 2, ..SynthOptions::new(Subset::Town1Loc, 1000, dir.clone()) }, &|_frames| ())?;
+//! generate(&SynthOptions { frames: 2, ..SynthOptions::new(Subset::Town1loc, 1000, dir.clone()) }, &|_frames| ())?;
 //! // The pose of the GNSS receiver against the true one.
 //! let options = EvaluationOptions { scenes: vec![dir.clone()], variant: None, every: 1, sweeps: None };
 //! let evaluated = evaluate_source(&mut RecordedPose, &options, &mut |_done, _of| ())?;
