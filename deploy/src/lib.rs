@@ -8,6 +8,16 @@
 //! - [`view`]: a page that shows a run, live or recorded, and its pictures.
 //!
 //! Each uses those before it in this list only; `view` uses `operate` and `score`.
+//!
+//! ```
+//! use deploy::scenario::Scenario;
+//!
+//! # fn main() -> Result<(), deploy::scenario::ScenarioError> {
+//! let scenario = Scenario::read("scenarios/demo.yaml".as_ref())?;
+//! assert_eq!(scenario.method.name(), "max");
+//! # Ok(())
+//! # }
+//! ```
 
 #![warn(clippy::print_stdout, clippy::print_stderr)]
 

@@ -5,6 +5,22 @@
 //! - [`misbehaviour`]: neighbours whose messages contradict the ego's perception.
 //!
 //! Conventions of axes, units and boxes are those of [`protocol`].
+//!
+//! ```
+//! use ego_fuser::pairing::{Pairing, PairingConfig};
+//! use protocol::CavId;
+//!
+//! # fn main() -> Result<(), protocol::IdError> {
+//! // A neighbour's map of 100 ms before is fused with the ego's frame, with its age.
+//! let neighbour = CavId::new("4288")?;
+//! let mut pairing = Pairing::new(PairingConfig::with_max_age_nanos(150_000_000));
+//! assert!(pairing.insert(&neighbour, 900_000_000, "map").is_none());
+//! let (paired, dropped) = pairing.pair(1_000_000_000);
+//! assert_eq!((*paired[0].message, paired[0].age_nanos), ("map", 100_000_000));
+//! assert!(dropped.is_empty());
+//! # Ok(())
+//! # }
+//! ```
 
 #![warn(clippy::print_stdout, clippy::print_stderr)]
 

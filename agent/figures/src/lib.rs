@@ -1,4 +1,19 @@
 //! Figures: line and point charts and drawn images, as PNG and SVG, by `plotters`.
+//!
+//! ```
+//! use figures::{Axis, Chart, Mark, Series, svg};
+//!
+//! # fn main() -> Result<(), figures::FigureError> {
+//! let chart = Chart {
+//!     title: "AP over latency".into(),
+//!     x: Axis::linear("latency, ms", [0.0, 500.0]),
+//!     y: Axis::linear("AP@0.5", [0.0, 1.0]),
+//!     series: vec![Series { name: "max".into(), points: vec![(0.0, 0.9), (500.0, 0.6)], mark: Mark::LineAndDots }],
+//! };
+//! assert!(svg(&[chart])?.contains("AP over latency"));
+//! # Ok(())
+//! # }
+//! ```
 
 mod chart;
 mod raster;

@@ -7,6 +7,28 @@
 //! - [`pose_source`]: origins of a vehicle's pose: recorded, noisy, estimated by one of the above.
 //! - [`tracker`]: the pose from sweep to sweep, with its covariance.
 //! - [`pose_error`], [`statistics`]: measures of their accuracy.
+//!
+//! ```
+//! use localization::pose_error::PoseError;
+//! use localization::registration::kabsch::PairMoments;
+//! use nalgebra::Vector3;
+//! use protocol::Pose;
+//!
+//! # fn main() -> Result<(), localization::registration::kabsch::Degenerate> {
+//! // Points of a sweep and the same points in the world, 2 m to the north.
+//! let mut pairs = PairMoments::default();
+//! for point in [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]] {
+//!     let lidar = Vector3::from(point);
+//!     pairs.add(&lidar, &(lidar + Vector3::new(0.0, 2.0, 0.0)), 1.0);
+//! }
+//! let world_from_lidar = pairs.fit()?;
+//! assert!((world_from_lidar.translation.y - 2.0).abs() < 1e-9);
+//!
+//! let error = PoseError::between(&Pose::from_xyz_yaw([0.0, 2.1, 0.0], 0.0), &Pose::from_xyz_yaw([0.0, 2.0, 0.0], 0.0));
+//! assert!((error.distance_m - 0.1).abs() < 1e-9);
+//! # Ok(())
+//! # }
+//! ```
 
 #![warn(clippy::print_stdout, clippy::print_stderr)]
 

@@ -9,6 +9,22 @@
 //! - [`train`]: optimiser, schedule, checkpoints and progress of every training.
 //!
 //! Tensors are `[N, C, H, W]`; the row of a BEV feature map grows with y, the column with x.
+//!
+//! ```
+//! use perception::detector::Detector;
+//! use perception::model_config::DetectorConfig;
+//! use perception::pillars::point_pillars::PointPillars;
+//! use tch::{Device, nn::VarStore};
+//!
+//! # fn main() -> Result<(), perception::model_config::ConfigError> {
+//! // An untrained network of the released sizes.
+//! let variables = VarStore::new(Device::Cpu);
+//! let detector = Detector::from_network(PointPillars::new(&variables.root(), &DetectorConfig::lean())?);
+//! let grid = detector.grid();
+//! assert_eq!((grid.width, grid.height, grid.cell_m), (128, 96, 0.8));
+//! # Ok(())
+//! # }
+//! ```
 
 #![warn(clippy::print_stdout, clippy::print_stderr)]
 

@@ -13,6 +13,15 @@
 //!
 //! The crate is not async: zenoh has its own runtimes, and a `put` that waits for a slow network must not block an
 //! executor. Inside tokio it needs the multi-thread runtime.
+//!
+//! ```
+//! use bus::bounded_queue::{BoundedQueue, PushOutcome};
+//!
+//! // KEEP_LAST(1) for each of at most 64 senders: the caller counts the message that was replaced.
+//! let queue = BoundedQueue::new(1, 64);
+//! assert_eq!(queue.push("4279", "map of frame 1"), PushOutcome::Queued);
+//! assert_eq!(queue.push("4279", "map of frame 2"), PushOutcome::Replaced("map of frame 1"));
+//! ```
 
 // This crate reads what other processes and people wrote: an index or a cast that does not fit is an error there, not
 // a panic or another number.

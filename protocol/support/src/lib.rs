@@ -6,6 +6,14 @@
 //! - [`statistics`], [`stage_times`], [`nanos`]: quantiles and correlations, the stopwatch, durations in nanoseconds.
 //! - [`rounding`]: floats to integers.
 //! - [`random`]: seeds derived from seeds, and draws that depend on the seed only.
+//!
+//! ```
+//! use support::statistics::{median, quantile, sorted};
+//!
+//! let latency_ms = [27.0, 31.0, 29.0, 58.0];
+//! assert_eq!(median(&latency_ms), Some(30.0));
+//! assert_eq!(quantile(&sorted(&latency_ms), 1.0), Some(58.0));
+//! ```
 
 // This crate reads what other processes and people wrote: an index or a cast that does not fit is an error there, not
 // a panic or another number.

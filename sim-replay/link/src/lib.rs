@@ -8,6 +8,23 @@
 //! - [`LinkEmulator`]: takes [`Packet`]s and returns their arrivals and losses.
 //! - `sim_replay::link_node`: the same between the agents and an ego of a live run.
 //! - [`DeviceClock`]: offset and drift of the senders' clock, which shift their capture times.
+//!
+//! ```
+//! use link::{Delivery, LinkEmulator, Packet};
+//! use protocol::{CavId, Stream};
+//!
+//! # fn main() -> Result<(), Box<dyn std::error::Error>> {
+//! // OpenCOOD's constant delay of 100 ms; the seed decides losses and delays of other models.
+//! let mut link = LinkEmulator::open("opencood-sim", 1)?;
+//! let (from, to) = (CavId::new("4288")?, CavId::new("4279")?);
+//! let (id, sequence, submitted_nanos) = (1, 0, 0);
+//! link.submit(Packet { id, from, to, stream: Stream::Bev, sequence, bytes: 75_000, submitted_nanos, distance_m: 20.0 });
+//! let outcomes = link.advance(1_000_000_000);
+//! assert_eq!(outcomes[0].nanos, 100_000_000);
+//! assert!(matches!(outcomes[0].delivery, Delivery::Arrived { .. }));
+//! # Ok(())
+//! # }
+//! ```
 
 // This crate reads what other processes and people wrote: an index or a cast that does not fit is an error there, not
 // a panic or another number.

@@ -15,6 +15,29 @@
 //! a chunk (power, disk, `kill -9`) is read up to its last whole chunk, a file with a changed bit is read without that
 //! chunk ([`Recording::damage`] lists the losses), and [`recover`] makes an indexed file of it again. Files rewritten
 //! by other programs are read too: compressed by zstd or lz4, or with messages outside of chunks.
+//!
+//! ```
+//! use protocol::{CavId, Key, Pose, PoseEstimate, RunId, Stamp, Stream, wire};
+//! use recording::{Recording, RecordingOptions, RecordingWriter};
+//!
+//! # fn main() -> Result<(), Box<dyn std::error::Error>> {
+//! let path = std::env::temp_dir().join(format!("v2vloc-{}.mcap", std::process::id()));
+//! let cav = CavId::new("4279")?;
+//! let key = Key::stream(&RunId::new("demo")?, &cav, Stream::Pose);
+//! let stamp = Stamp { cav, epoch: 7, sequence: 1, capture_nanos: 100_000_000, publish_nanos: 0 };
+//! let message = wire::encode(&stamp, PoseEstimate::new(Pose::from_xyz_yaw([12.0, -3.5, 1.9], 0.3), 0.8))?.to_vec();
+//!
+//! let mut writer = RecordingWriter::create(&path, RecordingOptions::default())?;
+//! writer.write(&key, 1_700_000_000_000_000_000, &message)?;
+//! writer.finish()?;
+//!
+//! let recording = Recording::open(&path)?;
+//! assert!(recording.damage().is_empty());
+//! assert_eq!(recording.read(&recording.entries()[0])?, message);
+//! # std::fs::remove_file(&path)?;
+//! # Ok(())
+//! # }
+//! ```
 
 // This crate reads what other processes and people wrote: an index or a cast that does not fit is an error there, not
 // a panic or another number.

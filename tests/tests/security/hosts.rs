@@ -1,5 +1,5 @@
 //! Fleet on three hosts over QUIC: a router, a vehicle and an ego, each in a network namespace with a virtual link to
-//! the router. The commands are those of `deploy/hosts.md`.
+//! the router. The commands are those of `deploy/docs/how-to/several-hosts.md`.
 
 use std::fs;
 use std::path::Path;

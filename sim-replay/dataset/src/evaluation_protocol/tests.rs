@@ -107,16 +107,16 @@ fn a_scenario_without_agents_of_the_kind_is_left_out() {
 
 #[test]
 fn the_page_of_data_sets_names_every_layout_and_protocol() {
-    let page = include_str!("../../../../deploy/datasets.md").replace('`', "");
+    let page = include_str!("../../../../deploy/docs/reference/datasets.md").replace('`', "");
     for layout in &crate::LAYOUTS {
         let row = format!("| {} | {} | {} |", layout.name, layout.data_sets, layout.files);
-        assert!(page.contains(&row), "deploy/datasets.md lacks {row}");
+        assert!(page.contains(&row), "deploy/docs/reference/datasets.md lacks {row}");
     }
     for (name, _) in PRESETS {
         let protocol = EvaluationProtocol::preset(name).unwrap();
         let row =
             page.lines().find(|line| line.starts_with('|') && line.split(['|', ',']).any(|cell| cell.trim() == name));
-        let row = row.unwrap_or_else(|| panic!("deploy/datasets.md lacks protocol {name}"));
+        let row = row.unwrap_or_else(|| panic!("deploy/docs/reference/datasets.md lacks protocol {name}"));
         let range = format!("| {} m |", protocol.ground_truth.comm_range_m);
         assert!(row.contains(&range), "{row} lacks {range}");
     }
