@@ -92,18 +92,28 @@ pub fn run(bus: &Bus, session: &RosSession, options: &NodeOptions, stop: &Stop) 
     let presence = bus.announce(Role::Ros2)?;
     let report = std::thread::scope(|scope| {
         let reading = inputs.map(|inputs| scope.spawn(move || inputs.run()));
-        let mut node = Node::new(scope, bus, session, options)?;
-        let ended = node.follow(&tap, &members);
-        node.end();
-        if ended.is_err() {
-            stop.request();
-        }
+        let followed = follow(scope, (bus, session, options), &tap, &members);
+        // After an error the threads of the LiDARs have to end too.
+        stop.request();
         let lidar = reading.map(|reading| reading.join().unwrap_or_default()).unwrap_or_default();
-        let left_out = node.left_out + tap.overwritten() + tap.undelivered();
-        ended.map(|()| NodeReport { published: node.published, left_out, lidar })
+        followed.map(|report| NodeReport { lidar, ..report })
     })?;
     presence.withdraw()?;
     Ok(report)
+}
+
+/// Publishes what the run publishes until `tap` is closed.
+fn follow<'scope, 'env>(
+    scope: &'scope Scope<'scope, 'env>,
+    (bus, session, options): (&'env Bus, &'env RosSession, &'env NodeOptions),
+    tap: &bus::PassiveSubscriber,
+    members: &BoundedQueue<(), LivelinessEvent>,
+) -> Result<NodeReport, BusError> {
+    let mut node = Node::new(scope, bus, session, options)?;
+    let followed = node.follow(tap, members);
+    std::mem::take(&mut node.sweeps).into_values().for_each(Forwarding::end);
+    let left_out = node.left_out + tap.overwritten() + tap.undelivered();
+    followed.map(|()| NodeReport { published: node.published, left_out, lidar: LidarReport::default() })
 }
 
 /// Sweeps of one vehicle, forwarded on a thread of their own.
@@ -289,10 +299,6 @@ impl<'scope, 'env> Node<'scope, 'env> {
         let name = topic.name(self.session.node().namespace.as_ref()).to_string();
         *self.published.entry(name).or_default() += 1;
         self.publishers.get_mut(&topic).map_or(Ok(()), |publisher| publisher.publish(cdr))
-    }
-
-    fn end(&mut self) {
-        std::mem::take(&mut self.sweeps).into_values().for_each(Forwarding::end);
     }
 }
 

@@ -15,7 +15,7 @@ use protocol::{
 };
 use re_cdr::{CdrReader, CdrWriter, LittleEndian};
 use ros2::endpoint::Attachment;
-use ros2::{Distribution, RosName, RosType};
+use ros2::{Distribution, RosType};
 use tests::bus::{TIMEOUT, TestRouter, next_event, wait_for};
 use zenoh::liveliness::LivelinessToken;
 use zenoh::{Session, Wait};
@@ -295,27 +295,26 @@ fn a_lidar_of_ros_is_that_of_an_agent_and_a_wrong_message_is_counted() {
         let inbox = agent.inbox(4, 1);
         let _subscription = agent.subscribe(topic(Stream::Lidar), &inbox).unwrap();
         std::thread::scope(|scope| {
-            let lidars = vec!["/velodyne/points=1000".parse().unwrap()];
+            let lidars = ["/velodyne/points=1000", "/broken=2000"].map(|text| text.parse().unwrap()).into();
             let options = NodeOptions { lidars, max_intensity: 255.0, ..NodeOptions::default() };
             let node = start(scope, &router, (distribution, options), &stop);
             let driver = other_node(&router);
             let _node = announce(&driver);
-            wait_for("the subscription", || {
+            wait_for("the subscriptions", || {
                 let tokens = tokens(&driver, &format!("@ros2_lv/{DOMAIN}/*/0/*/MS/**"));
-                tokens.iter().any(|token| token.contains("/%velodyne%points/"))
+                let has = |topic: &str| tokens.iter().any(|token| token.contains(topic));
+                has("/%velodyne%points/") && has("/%broken/")
             });
-            let name = RosName::new("/velodyne/points").unwrap();
             let hash = RosType::PointCloud2.hash(distribution);
-            let key = key(name.as_str().trim_start_matches('/'), POINTS, &hash);
-            let put = |cloud: Vec<u8>| {
+            let put = |topic: &str, cloud: Vec<u8>| {
                 let attachment = Attachment { sequence: 1, source_nanos: 1, gid: [7; 16] };
-                driver.put(&key, cloud).attachment(attachment.to_bytes()).wait().unwrap();
+                driver.put(key(topic, POINTS, &hash), cloud).attachment(attachment.to_bytes()).wait().unwrap();
             };
-            put(driver_cloud(AT, 12));
+            put("broken", driver_cloud(AT, 12));
             let mut sent = 0;
             let arrival = loop {
                 sent += 1;
-                put(driver_cloud(AT + sent, 16));
+                put("velodyne/points", driver_cloud(AT + sent, 16));
                 match inbox.take(Some(Instant::now() + Duration::from_millis(100))) {
                     Pop::Item(_, Event::Message(arrival)) => break arrival,
                     Pop::Item(..) | Pop::TimedOut => assert!(sent < 600, "nothing arrives"),

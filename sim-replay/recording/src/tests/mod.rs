@@ -1,6 +1,7 @@
 //! Recordings written, read back, truncated and on a full disk.
 
 mod damaged;
+mod export;
 mod public_reader;
 
 use std::io::{self, Write};
