@@ -14,12 +14,14 @@ programs are not there.
 
 import json
 import math
+import os
 import pathlib
 import socket
 import subprocess
 import sys
 import tempfile
 import time
+import traceback
 
 try:
     import numpy
@@ -289,7 +291,7 @@ def check_robot(programs, client, bodies, poses):
     client.subscribe("/cav_robot/pose", "geometry_msgs/msg/PoseWithCovarianceStamped")
     where = {"domain_id": DOMAIN, "router_ip": "127.0.0.1", "router_port": client.port}
     wait_for("the subscription", lambda: get_topic_info("/velodyne_points", **where))
-    wait_for("the agent", lambda: get_topic_info("/cav_robot/pose", **where))
+    wait_for("the agent", lambda: get_topic_info("/cav_robot/pose", **where).publisher_count)
     name = "sensor_msgs/msg/PointCloud2"
     publisher = ROS2Publisher(
         "/velodyne_points", name, msg_definition=client.types.definition(name), type_hash=client.types.hash(name),
@@ -386,4 +388,12 @@ if __name__ == "__main__":
     if len(sys.argv) != 2:
         print(__doc__, file=sys.stderr)
         sys.exit(2)
-    sys.exit(main(sys.argv[1]))
+    try:
+        code = main(sys.argv[1])
+    except Exception:
+        traceback.print_exc()
+        code = 1
+    sys.stdout.flush()
+    sys.stderr.flush()
+    # The client's session has threads that call back into Python; closing it may wait for ever.
+    os._exit(code)

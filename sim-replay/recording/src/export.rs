@@ -44,8 +44,6 @@ pub fn export_ros2(
     zstd_level: Option<u32>,
 ) -> Result<ExportReport, RecordingError> {
     let recording = Recording::open(from)?;
-    let options = RecordingOptions { zstd_level, contents: Contents::Ros2 };
-    let mut writer = RecordingWriter::create(to, options)?;
     let nanos = |entry: &Entry| match times {
         ExportTimes::Capture if matches!(entry.key.topic, Topic::Stats(_)) => None,
         ExportTimes::Capture => Some(entry.header.stamp.capture_nanos),
@@ -53,6 +51,12 @@ pub fn export_ros2(
     };
     let wanted: Vec<&Entry> = recording.entries().iter().filter(|entry| Translator::wants(&entry.key.topic)).collect();
     let timed = in_order(&wanted, nanos);
+    if timed.is_empty() {
+        let reason = "it holds no message that can be read and that ROS 2 has a type for; recordings of other versions of this program cannot be read";
+        return Err(RecordingError::NotOurs { path: from.into(), reason: reason.into() });
+    }
+    let options = RecordingOptions { zstd_level, contents: Contents::Ros2 };
+    let mut writer = RecordingWriter::create(to, options)?;
     let vehicles: BTreeSet<CavId> = wanted.iter().filter_map(|entry| vehicle(&entry.key.topic)).collect();
     if let Some((first, _)) = timed.first().filter(|_| !vehicles.is_empty()) {
         writer.write_static_transforms(*first, &vehicles, mount)?;
