@@ -174,6 +174,12 @@ impl KeyExpr {
         Self(format!("{KEY_ROOT}/{run}/{UNDECLARED}"))
     }
 
+    /// One key.
+    #[must_use]
+    pub fn one(key: &Key) -> Self {
+        Self(key.to_string())
+    }
+
     /// One stream of every vehicle, before the link.
     #[must_use]
     pub fn stream(run: &RunId, stream: Stream) -> Self {
