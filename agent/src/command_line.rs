@@ -33,6 +33,8 @@ enum Command {
     Eval(Forwarded),
     /// Localize recorded sweeps and write their poses to a table
     Localize(Forwarded),
+    /// Find the pose of single point clouds
+    Locate(Forwarded),
     /// Prepare a scene head for 8-bit inference
     Quantise(Forwarded),
     /// Train the networks of the localization
@@ -49,6 +51,7 @@ impl Command {
             }
             Self::Eval(forwarded) => Ok(offline(forwarded, "eval")?),
             Self::Localize(forwarded) => Ok(offline(forwarded, "localize")?),
+            Self::Locate(forwarded) => Ok(offline(forwarded, "locate")?),
             Self::Quantise(forwarded) => Ok(offline(forwarded, "quantise")?),
             Self::Train(forwarded) => Ok(offline(forwarded, "train")?),
         }

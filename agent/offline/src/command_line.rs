@@ -26,6 +26,7 @@ pub(crate) struct Cli {
 enum Command {
     Eval(command::eval::Args),
     Localize(command::localize::Args),
+    Locate(command::locate::Args),
     Quantise(command::quantise::Args),
     Train(command::train::Args),
 }
@@ -36,6 +37,7 @@ pub(crate) fn run(cli: Cli) -> ExitCode {
     let outcome = kept.and_then(|()| match cli.command {
         Command::Eval(args) => command::eval::run(&args),
         Command::Localize(args) => command::localize::run(&args),
+        Command::Locate(args) => command::locate::run(&args),
         Command::Quantise(args) => command::quantise::run(&args),
         Command::Train(args) => command::train::run(&args).map(|()| Outcome::Done),
     });
