@@ -10,6 +10,7 @@ mod losses;
 mod statistics;
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 use std::time::Instant;
 
 use tch::nn::VarStore;
@@ -20,12 +21,14 @@ pub use self::config::{SceneReport, SceneSummary, SceneTrainConfig};
 use self::cell_order::CellOrder;
 use self::coarse_pose::CoarsePoses;
 use self::features::Features;
+pub(crate) use self::features::SceneSweeps;
 use self::losses::{centre_loss, weighted_loss};
 use super::error::LocalizerTrainError;
 use super::feature_cache::FeatureCache;
 use super::kmeans::kmeans;
 use super::redundancy::Redundancy;
 use super::scene_validation::{SceneAccuracy, validate};
+use super::sweep_store::SweepList;
 use localization::pgc::SceneHead;
 use localization::pgc::SceneHeadConfig;
 use perception::train::{Curve, DataListing, Length, Trainer};
@@ -48,7 +51,28 @@ pub fn train_scene(
     config: &SceneTrainConfig,
     observe: &mut dyn FnMut(&SceneReport),
 ) -> Result<SceneSummary, LocalizerTrainError> {
-    let mut training = Training::prepare(config, observe)?;
+    let training = Arc::new(SweepList::open(&config.scenes)?);
+    let validation = match config.validation.as_slice() {
+        [] => None,
+        folders => {
+            let mut list = SweepList::open(folders)?;
+            list.thin_out(config.validation_sweeps);
+            Some(Arc::new(list))
+        }
+    };
+    train_scene_on(config, &SceneSweeps { training, validation }, observe)
+}
+
+/// The same on lists of sweeps in place of the folders of `config`.
+///
+/// # Errors
+/// As [`train_scene`].
+pub(crate) fn train_scene_on(
+    config: &SceneTrainConfig,
+    sweeps: &SceneSweeps,
+    observe: &mut dyn FnMut(&SceneReport),
+) -> Result<SceneSummary, LocalizerTrainError> {
+    let mut training = Training::prepare(config, sweeps, observe)?;
     let mut last_validation = Instant::now();
     while training.share_done() < 1.0 {
         training.step()?;
@@ -89,12 +113,13 @@ struct Training<'a> {
 impl<'a> Training<'a> {
     fn prepare(
         config: &'a SceneTrainConfig,
+        sweeps: &SceneSweeps,
         observe: &mut dyn FnMut(&SceneReport),
     ) -> Result<Self, LocalizerTrainError> {
         let started = Instant::now();
         let run = &config.run;
         run.start()?;
-        let features = Features::compute(config, observe)?;
+        let features = Features::compute(config, sweeps, observe)?;
         let head_config = head_config(config, &features)?;
         let Features { training: cache, validation, data, .. } = features;
         let variables = VarStore::new(run.device);
