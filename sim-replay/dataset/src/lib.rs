@@ -30,6 +30,7 @@ mod faults;
 mod files;
 pub mod frame;
 mod frame_files;
+mod generated_map;
 pub mod ground_truth;
 pub mod hdf5_file;
 mod hdf5_poses;
@@ -70,6 +71,7 @@ use protocol::{CavId, Handedness};
 use serde::Serialize;
 
 pub use error::ReadError;
+pub use generated_map::GeneratedMap;
 pub use layouts::{LAYOUTS, Layout, LayoutRow, layouts_text};
 pub use left_out::LeftOut;
 pub use listing::content_sha256;

@@ -16,8 +16,6 @@ use super::train::options::check_folders;
 
 /// Name of the report beside the weights.
 const REPORT_FILE: &str = "map.json";
-/// Cells of a step.
-const BATCH: usize = 4096;
 
 /// Make a head for a place from drives through it, with which vehicles find themselves there (agent locate, agent run).
 ///
@@ -114,7 +112,6 @@ impl Args {
             time,
             most_sweeps: self.sweeps.map(|count| usize::try_from(count).unwrap_or(usize::MAX)),
             run: RunConfig {
-                batch: BATCH,
                 learning_rate: 2e-3,
                 seed: self.seed,
                 device,
@@ -159,7 +156,7 @@ fn write(config: &MapConfig, report: &MapReport) -> anyhow::Result<()> {
         "World coordinates of cells on the features of a frozen encoder, made by `agent map`.",
     );
     let data = format!("{} sweeps of {} drives", report.training_sweeps, config.drives.len());
-    card.trained(&config.run, &report.trained, &data, "cells");
+    card.trained(&report.run, &report.trained, &data, "cells");
     card.row("file with confidence and scales", format_args!("SHA-256 `{}`", report.sha256));
     card.row("copies of each sweep", report.copies);
     card.row("encoder", format_args!("`{ENCODER_FILE}` beside the head"));

@@ -2,6 +2,8 @@
 //!
 //! Wrong poses come from mirrored sweeps: a street with left and right exchanged is another place, seen by the same LiDAR.
 
+use std::time::Instant;
+
 use nalgebra::Isometry3;
 use protocol::{PointCloud, Pose};
 use rand::{Rng, SeedableRng};
@@ -26,11 +28,10 @@ pub(super) struct Check {
     pub(super) sweeps: Vec<EvaluatedSweep>,
     /// Poses of these, of copies and of mirrored sweeps, with their errors.
     pub(super) labelled: Vec<Labelled>,
-    /// Number of mirrored sweeps that were localized.
-    pub(super) mirrored: usize,
 }
 
-/// Localizes the sweeps of `list`, copies of them, and mirrored ones; `progress` gets the number done and of all.
+/// Localizes the sweeps of `list` and their mirror images, then copies of both until `deadline`; `progress` gets the
+/// number done and of all.
 ///
 /// # Errors
 /// [`LocalizerError`] when the tensor library fails. Sweeps that cannot be read are left out and counted in `list`.
@@ -38,31 +39,32 @@ pub(super) fn check(
     localizer: &Localizer,
     list: &SweepList,
     seed: u64,
+    deadline: Instant,
     progress: &mut dyn FnMut(usize, usize),
 ) -> Result<Check, LocalizerError> {
     let copies = LEAST_CHECKED.div_ceil(list.len().max(1));
     let mut check = Check::default();
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    for index in 0..list.len() {
+    for number in 0..copies * list.len() {
+        let (copy, index) = (number / list.len(), number % list.len());
+        if copy > 0 && Instant::now() > deadline {
+            break;
+        }
+        progress(number, copies * list.len());
         let Some((frame, scenario, stem)) = list.frame(index) else { continue };
         let Some(truth) = frame.world_from_lidar else { continue };
-        for copy in 0..copies {
-            progress(index * copies + copy, list.len() * copies);
-            let (cloud, turned) = match copy {
-                0 => (frame.points.clone(), truth),
-                _ => turned(&frame.points, &truth, &mut rng),
-            };
-            let localization = localizer.localize(&cloud)?;
-            let (cav, scenario, stem) = (frame.cav.clone(), scenario.clone(), stem.clone());
-            let sweep = EvaluatedSweep { scenario, cav, stem, truth: turned, localization };
-            check.labelled.extend(sweep.labelled());
-            let mirrored = EvaluatedSweep { localization: localizer.localize(&mirrored(&cloud))?, ..sweep.clone() };
-            check.mirrored += 1;
-            // A straight street is its own mirror image: a pose near the true one is no example of a wrong pose.
-            check.labelled.extend(mirrored.labelled().filter(|labelled| labelled.error_m > BAD_M));
-            if copy == 0 {
-                check.sweeps.push(sweep);
-            }
+        let (cloud, truth) = match copy {
+            0 => (frame.points, truth),
+            _ => turned(&frame.points, &truth, &mut rng),
+        };
+        let localization = localizer.localize(&cloud)?;
+        let sweep = EvaluatedSweep { scenario, cav: frame.cav, stem, truth, localization };
+        check.labelled.extend(sweep.labelled());
+        let mirrored = EvaluatedSweep { localization: localizer.localize(&mirrored(&cloud))?, ..sweep.clone() };
+        // A straight street is its own mirror image: a pose near the true one is no example of a wrong pose.
+        check.labelled.extend(mirrored.labelled().filter(|labelled| labelled.error_m > BAD_M));
+        if copy == 0 {
+            check.sweeps.push(sweep);
         }
     }
     Ok(check)

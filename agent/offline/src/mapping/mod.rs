@@ -20,8 +20,8 @@ use self::plan::{Plan, feature_bytes, too_little_memory};
 use crate::evaluation::LocalizationSummary;
 use crate::head_files::ENCODER_FILE;
 use crate::training::{
-    FeatureCache, LocalizerTrainError, SceneReport, SceneSummary, SceneSweeps, SceneTrainConfig, SweepAugmentation,
-    SweepList, train_scene_on,
+    CELLS, FeatureCache, LocalizerTrainError, SceneReport, SceneSummary, SceneSweeps, SceneTrainConfig,
+    SweepAugmentation, SweepList, train_scene_on,
 };
 use localization::pgc::confidence::{CONFIDENCE_KEY, Confidence, ConfidenceModel, FitReport};
 use localization::pgc::{Localizer, LocalizerError, SceneEncoder};
@@ -32,6 +32,10 @@ use perception::weights::{WeightsError, annotate};
 
 /// Sweeps that are encoded to measure their time.
 const PROBES: usize = 8;
+/// Batches of a pass over the cells, and the bounds of a batch: a small place has smaller ones, and so more steps.
+const BATCHES: usize = 40;
+const LEAST_BATCH: usize = 512;
+const MOST_BATCH: usize = 4096;
 /// Sweeps of the search for scales.
 const SCALE_SWEEPS: usize = 30;
 /// Largest share of good poses that the confidence may reject.
@@ -130,7 +134,7 @@ pub fn make_map(config: &MapConfig, observe: &mut dyn FnMut(MapProgress)) -> Res
     let training = Arc::new(sweeps.list.subset(&thinned(&sweeps.training, plan.training)));
     let held_out = sweeps.list.subset(&thinned(&sweeps.held_out, plan.checked));
     let coverage = sweeps.coverage(&thinned(&sweeps.training, plan.training));
-    let summary = map.train(&training, &plan)?;
+    let (summary, run) = map.train(&training, &plan)?;
     map.copy_encoder()?;
     let weights = summary.trained.weights.clone();
     let activation_scales = map.quantise(&weights, &training)?;
@@ -152,6 +156,7 @@ pub fn make_map(config: &MapConfig, observe: &mut dyn FnMut(MapProgress)) -> Res
         left_out: data.left_out(),
         seconds: map.seconds(),
         trained: summary.trained,
+        run,
     })
 }
 
@@ -293,9 +298,13 @@ impl Map<'_> {
         ));
     }
 
-    fn train(&mut self, training: &Arc<SweepList>, plan: &Plan) -> Result<SceneSummary, MapError> {
+    fn train(&mut self, training: &Arc<SweepList>, plan: &Plan) -> Result<(SceneSummary, RunConfig), MapError> {
         let left_s = (self.config.time.as_secs_f64() - self.seconds() - plan.check_s).max(1.0);
-        let run = RunConfig { length: Length::Time(Duration::from_secs_f64(left_s)), ..self.config.run.clone() };
+        let run = RunConfig {
+            length: Length::Time(Duration::from_secs_f64(left_s)),
+            batch: (plan.training * plan.copies * CELLS / BATCHES).clamp(LEAST_BATCH, MOST_BATCH),
+            ..self.config.run.clone()
+        };
         let classes = (plan.training / 12).clamp(4, 150).min(plan.training.max(1)) as i64;
         let config = SceneTrainConfig {
             scenes: self.config.drives.clone(),
@@ -310,7 +319,7 @@ impl Map<'_> {
             refiner: true,
             augmentation: SweepAugmentation { copies: plan.copies, turn_rad: 10.0_f64.to_radians(), keep: 0.7 },
             redundancy: None,
-            run,
+            run: run.clone(),
             validate_every: CHECKPOINT_EVERY,
         };
         let sweeps = SceneSweeps { training: Arc::clone(training), validation: None };
@@ -329,7 +338,7 @@ impl Map<'_> {
             };
             observe(MapProgress::At(started.elapsed().as_secs_f64(), text));
         };
-        Ok(train_scene_on(&config, &sweeps, &mut tell)?)
+        Ok((train_scene_on(&config, &sweeps, &mut tell)?, run))
     }
 
     /// Copies the encoder beside the head, so that the folder is all that is needed.
@@ -367,7 +376,8 @@ impl Map<'_> {
             let text = format!("checking, {done} of {all} sweeps");
             observe(MapProgress::At(started.elapsed().as_secs_f64(), text));
         };
-        Ok(check::check(&localizer, held_out, self.config.run.seed, &mut progress)?)
+        let deadline = started + self.config.time;
+        Ok(check::check(&localizer, held_out, self.config.run.seed, deadline, &mut progress)?)
     }
 
     /// Fits the confidence, writes it into the head and applies it; the report and the new digest.

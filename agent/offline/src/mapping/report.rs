@@ -1,7 +1,7 @@
 //! Report of a map: what the head was made of, how accurate it is, and where.
 
 use localization::pgc::confidence::FitReport;
-use perception::train::Trained;
+use perception::train::{RunConfig, Trained};
 use serde::Serialize;
 
 use super::coverage::Coverage;
@@ -33,6 +33,9 @@ pub struct MapReport {
     /// Weights, steps and time of the training.
     #[serde(skip)]
     pub trained: Trained,
+    /// Configuration of the training.
+    #[serde(skip)]
+    pub run: RunConfig,
 }
 
 /// Accuracy on sweeps that were not trained on.

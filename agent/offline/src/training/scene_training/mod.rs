@@ -11,7 +11,7 @@ mod statistics;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use tch::nn::VarStore;
 use tch::{Kind, Tensor, no_grad};
@@ -31,13 +31,15 @@ use super::scene_validation::{SceneAccuracy, validate};
 use super::sweep_store::SweepList;
 use localization::pgc::SceneHead;
 use localization::pgc::SceneHeadConfig;
-use perception::train::{Curve, DataListing, Length, Trainer};
+use perception::train::{Curve, DataListing, Length, RunConfig, Trainer};
 use perception::weights::{CONFIG_KEY, KIND_KEY};
 
 /// Weight of a unit of cross entropy over the centres, metres.
 const CENTRE_WEIGHT_M: f64 = 5.0;
 /// Steps between two draws of the classifier's dropout.
 const LOGITS_EVERY: u64 = 50;
+/// Largest share of a training by the clock that its classifier takes.
+const CLASSIFIER_SHARE: f64 = 0.12;
 /// Steps between two reports.
 const REPORT_EVERY: u64 = 20;
 /// Largest number of cells of a sweep that a head regresses.
@@ -129,7 +131,14 @@ impl<'a> Training<'a> {
         let (_, class_of_sweep) = kmeans(&positions, config.classes as usize, run.seed);
         statistics::set_statistics(&mut head, &cache, run.seed)?;
         if !run.resume {
-            let share = classifier::train_classifier(&head, &variables, &cache, &class_of_sweep, run.seed)?;
+            let share = classifier::train_classifier(
+                &head,
+                &variables,
+                &cache,
+                &class_of_sweep,
+                run.seed,
+                classifier_time(run),
+            )?;
             observe(&SceneReport::Classified(share));
         }
         let trainer = Trainer::begin(run, &variables, None, started)?;
@@ -255,6 +264,14 @@ impl<'a> Training<'a> {
             cells_shown: self.cells_shown,
             accuracy: self.accuracy,
         })
+    }
+}
+
+/// Longest time of the classifier's training: a part of a training by the clock.
+fn classifier_time(run: &RunConfig) -> Option<Duration> {
+    match run.length {
+        Length::Time(limit) => Some(limit.mul_f64(CLASSIFIER_SHARE)),
+        Length::Steps(_) | Length::Epochs(_) => None,
     }
 }
 
