@@ -127,9 +127,10 @@ fn size_of_one(descr: &str) -> Result<usize, String> {
 
 fn named(fields: &str, shape: &[usize]) -> Result<Columns, String> {
     let fields = fields_of(fields)?;
+    let is_number = |(_, scalar): &(String, Scalar)| scalar.kind != ScalarKind::Padding;
     let find = |names: &[&str]| {
         let index =
-            names.iter().find_map(|name| fields.iter().position(|(found, _)| found.eq_ignore_ascii_case(name)))?;
+            names.iter().find_map(|name| fields.iter().position(|field| is_number(field) && field.0.eq_ignore_ascii_case(name)))?;
         let first = fields.iter().take(index).map(|(_, scalar)| scalar.size).sum();
         fields.get(index).map(|(name, scalar)| (name.clone(), (first, *scalar)))
     };
@@ -228,5 +229,7 @@ mod tests {
         assert!(message(array("<f4", false, "18446744073709551615, 4", &[])).contains("cut off"));
         assert!(decode(b"\x93NUMPY\x01\x00\xff\xff").unwrap_err().contains("header of 65535 bytes stated"));
         assert!(decode(b"PK").is_err());
+        let padding = "{'descr': [('x', '|V0'), ('y', '|V0'), ('z', '|V0')], 'fortran_order': False, 'shape': (9,), }";
+        assert!(decode(&file(padding, b"")).unwrap_err().contains("no field x"));
     }
 }

@@ -7,6 +7,8 @@ use crate::training::CELLS;
 
 /// Largest share of the time before the check that is spent on encoding.
 const ENCODING_SHARE: f64 = 0.5;
+/// Largest share of the time that the check takes.
+const CHECK_SHARE: f64 = 0.25;
 /// Most sweeps that the head is checked on.
 const MOST_CHECKED: usize = 200;
 /// Most passes that a small place gets, rotated and subsampled.
@@ -39,7 +41,7 @@ impl Plan {
         let checked_s = |count: usize| 4.0 * sweep_s * count as f64;
         let most_checked = (0.2 * total_s / checked_s(1)) as usize;
         let checked = held_out.min(MOST_CHECKED).min(most_checked.max(10));
-        let check_s = checked_s(if held_out > 0 { checked.max(LEAST_CHECKED) } else { 0 });
+        let check_s = checked_s(if held_out > 0 { checked.max(LEAST_CHECKED) } else { 0 }).min(CHECK_SHARE * total_s);
         let affordable = ((total_s - check_s).max(0.0) * ENCODING_SHARE / sweep_s) as usize;
         let copies = (ENOUGH_SWEEPS / training.max(1)).clamp(1, MOST_COPIES);
         let copies = copies.min((affordable / training.max(1)).max(1));
