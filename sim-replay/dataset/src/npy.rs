@@ -129,8 +129,9 @@ fn named(fields: &str, shape: &[usize]) -> Result<Columns, String> {
     let fields = fields_of(fields)?;
     let is_number = |(_, scalar): &(String, Scalar)| scalar.kind != ScalarKind::Padding;
     let find = |names: &[&str]| {
-        let index =
-            names.iter().find_map(|name| fields.iter().position(|field| is_number(field) && field.0.eq_ignore_ascii_case(name)))?;
+        let index = names
+            .iter()
+            .find_map(|name| fields.iter().position(|field| is_number(field) && field.0.eq_ignore_ascii_case(name)))?;
         let first = fields.iter().take(index).map(|(_, scalar)| scalar.size).sum();
         fields.get(index).map(|(name, scalar)| (name.clone(), (first, *scalar)))
     };

@@ -13,7 +13,6 @@ mod int8_block;
 mod int8_levels;
 mod levelling;
 pub(crate) mod localize;
-pub mod pose_covariance;
 mod pose_evidence;
 pub mod pose_refinement;
 pub mod pose_search;

@@ -47,7 +47,7 @@ pub struct FoundPose {
     pub evidence: PoseEvidence,
     /// Covariance of position (metres) and rotation about the axes of the world (radians) from the residuals of the
     /// cells alone: its shape is right, but errors of neighbouring cells are correlated, so it is too small
-    /// ([`super::pose_covariance`]).
+    /// ([`crate::pose_covariance`]).
     pub cell_covariance: [[f64; 6]; 6],
     /// Confidence, 0..=1.
     pub sigma: f64,

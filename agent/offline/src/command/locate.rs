@@ -4,9 +4,9 @@ use std::path::PathBuf;
 
 use agent_offline::head_files::{encoder_of, head_file};
 use dataset::cloud_files::{Cloud, CloudFile, clouds_at};
-use localization::pgc::pose_covariance::pose_covariance;
 use localization::pgc::pose_solver::FoundPose;
 use localization::pgc::{Localization, Localizer};
+use localization::pose_covariance::pose_covariance;
 use perception::inference::Inference;
 use perception::int8::InferencePrecision;
 use protocol::{NoPoseReason, PoseEstimate};

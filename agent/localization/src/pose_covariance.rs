@@ -2,7 +2,7 @@
 
 use nalgebra::{Matrix6, Vector6};
 
-use super::pose_solver::FoundPose;
+use crate::pgc::pose_solver::FoundPose;
 use crate::tracker::PoseMeasurement;
 
 /// Largest variance, square metres or radians: that of a pose that nothing constrains.
