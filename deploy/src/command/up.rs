@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use deploy::experiment::report;
 use deploy::run::run_fleet::{RunOptions, run_scenario};
-use deploy::scenario::Scenario;
+use deploy::scenario::{FieldOverride, Scenario};
 use fusion::Method;
 use protocol::RunId;
 use support::output;
@@ -34,6 +34,10 @@ pub(crate) struct Arguments {
     /// Seconds of the scene per second in place of the scenario's: below 1 slower, for machines that do not keep up.
     #[arg(long, value_name = "TIMES")]
     rate: Option<f64>,
+    /// Another value for a field of the scenario, by its path: scene.lockstep=true, agents.codec.dtype=i8. May be
+    /// repeated.
+    #[arg(long, value_name = "FIELD=VALUE")]
+    set: Vec<FieldOverride>,
     /// Record all messages in recording.mcap in the run folder; the scenario may exclude some.
     #[arg(long)]
     record: bool,
@@ -49,7 +53,7 @@ pub(crate) struct Arguments {
 impl Arguments {
     /// Runs the scenario and prints the result.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
-        let mut scenario = Scenario::read(&self.scenario)?;
+        let mut scenario = Scenario::read_with(&self.scenario, &self.set)?;
         if let Some(scene) = self.scene {
             scenario.scene.dir = std::path::absolute(scene)?;
         }

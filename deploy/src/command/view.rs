@@ -8,6 +8,7 @@ use std::time::{Duration, Instant};
 use bus::shutdown::Stop;
 use bus::web::WebServer;
 use bus::{Bus, BusOptions, Credentials, Endpoint, Identity, process_id};
+use deploy::operate::status::{Phase, RunStatus};
 use deploy::view::{LiveRun, RecordedRun, ViewError, serve_live, serve_recorded};
 use protocol::{CavId, Role, RunId};
 use support::output;
@@ -21,10 +22,14 @@ const VIEWER_NICENESS: i32 = 15;
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct Arguments {
-    /// Folder of a recorded run (`v2vloc up --record`), or its recording.mcap.
-    #[arg(required_unless_present = "live", conflicts_with = "live")]
+    /// Folder of a run, or its name in --runs: shown live while it goes on, otherwise from its recording (`v2vloc up
+    /// --record`); or a recording.mcap [default: the newest run in --runs].
+    #[arg(conflicts_with = "live")]
     run: Option<PathBuf>,
-    /// Show a live run, which --name and --connect identify.
+    /// Folder of the run folders.
+    #[arg(long, default_value = "runs")]
+    runs: PathBuf,
+    /// Show a live run without a folder here, which --name and --connect identify.
     #[arg(long, requires_all = ["name", "connect"])]
     live: bool,
     /// Name of the live run.
@@ -46,21 +51,21 @@ impl Arguments {
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
         let stop = Stop::new();
         stop.on_signals()?;
-        let server = match (&self.run, &self.name, &self.connect) {
-            (Some(path), _, _) => {
-                let run = RecordedRun::open(path).map_err(|error| match error {
+        let server = match self.shown()? {
+            Shown::Recorded(path) => {
+                let run = RecordedRun::open(&path).map_err(|error| match error {
                     ViewError::NotRecorded(_) | ViewError::Empty(_) => anyhow::Error::from(BadInput::of(error)),
                     ViewError::Recording(_) => anyhow::Error::from(error),
                 })?;
                 output::note(format_args!("{} moments of run {}", run.len(), run.name()));
                 serve_recorded(self.listen, Arc::new(run))
             }
-            (None, Some(name), Some(router)) => {
+            Shown::Live(name, router) => {
                 // On the machine of the run, the run has priority.
                 let _ = rustix::process::nice(VIEWER_NICENESS);
                 let cav = CavId::new("viewer")?;
-                let identity = Identity { run: name.clone(), process: process_id(Role::Viewer, &cav), cav };
-                let mut options = BusOptions::client(router.clone());
+                let identity = Identity { run: name, process: process_id(Role::Viewer, &cav), cav };
+                let mut options = BusOptions::client(router);
                 if let Some(folder) = &self.keys {
                     let credentials = Credentials::read(folder)?;
                     credentials.check_name(identity.process.as_str())?;
@@ -69,15 +74,40 @@ impl Arguments {
                 let bus = Bus::join(&options, identity)?;
                 serve_live(self.listen, Arc::new(LiveRun::start(bus)?))
             }
-            (None, _, _) => {
-                return Err(BadInput::new("name a run folder, or --live --name RUN --connect ROUTER").into());
-            }
         };
         let server = server.map_err(|error| BadInput::new(format!("cannot serve at {}: {error}", self.listen)))?;
         output::note(format_args!("http://{}/ (Ctrl-C ends it)", server.address()));
         while !stop.wait_until(Instant::now() + Duration::from_secs(3600)) {}
         warn_dropped(&server);
         Ok(Outcome::Done)
+    }
+}
+
+/// The run that is shown.
+enum Shown {
+    /// A run folder or a recording.
+    Recorded(PathBuf),
+    /// A run that goes on, and its router.
+    Live(RunId, Endpoint),
+}
+
+impl Arguments {
+    fn shown(&self) -> anyhow::Result<Shown> {
+        if let (Some(name), Some(router)) = (&self.name, &self.connect) {
+            return Ok(Shown::Live(name.clone(), router.clone()));
+        }
+        if let Some(file) = self.run.as_ref().filter(|path| path.is_file()) {
+            return Ok(Shown::Recorded(file.clone()));
+        }
+        let folder = RunStatus::folder(self.run.clone(), &self.runs).map_err(BadInput::of)?;
+        match RunStatus::read(&folder) {
+            Ok(RunStatus { phase: Phase::Running, run, endpoint, .. }) => {
+                output::note(format_args!("run {run} goes on at {endpoint}"));
+                Ok(Shown::Live(run.parse()?, endpoint.parse()?))
+            }
+            // Without a status it may still hold a recording.
+            _ => Ok(Shown::Recorded(folder)),
+        }
     }
 }
 

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use bus::config_file::{self, ConfigError};
 
-use super::{Scenario, ScenarioError};
+use super::{FieldOverride, Scenario, ScenarioError};
 
 impl Scenario {
     /// Reads and checks a scenario. Relative paths are resolved against its folder.
@@ -31,7 +31,19 @@ impl Scenario {
     /// # Errors
     /// [`ScenarioError`] when the file cannot be read or is no scenario.
     pub fn read(path: &Path) -> Result<Self, ScenarioError> {
+        Self::read_with(path, &[])
+    }
+
+    /// The same with other values for some fields.
+    ///
+    /// # Errors
+    /// As [`Self::read`]; also when a field that is set is not one of a scenario.
+    pub fn read_with(path: &Path, overrides: &[FieldOverride]) -> Result<Self, ScenarioError> {
+        // Read as it is first: errors of the file have lines.
         let mut scenario: Self = config_file::read(path)?;
+        if !overrides.is_empty() {
+            scenario = overridden(path, overrides)?;
+        }
         let file = std::path::absolute(path).map_err(|source| ConfigError::Io { path: path.into(), source })?;
         let folder = file.parent().unwrap_or(Path::new("/"));
         let absolute = |place: &Path| without_dots(&folder.join(place));
@@ -47,6 +59,22 @@ impl Scenario {
         }
         Ok(scenario)
     }
+}
+
+/// The scenario of a file with other values for some fields.
+fn overridden(path: &Path, overrides: &[FieldOverride]) -> Result<Scenario, ScenarioError> {
+    let mut document: serde_json::Value = config_file::read(path)?;
+    for field in overrides {
+        field.apply(&mut document);
+        // One by one, so that an error names the field.
+        serde_json::from_value::<Scenario>(document.clone()).map_err(|error| ConfigError::Syntax {
+            path: path.into(),
+            line: None,
+            reason: format!("--set {field}: {error}"),
+        })?;
+    }
+    serde_json::from_value(document)
+        .map_err(|error| ConfigError::Syntax { path: path.into(), line: None, reason: error.to_string() }.into())
 }
 
 /// The path without `.` and `a/..`, for readable messages and resolved copies.
@@ -86,6 +114,26 @@ mod tests {
         assert_eq!(scenario.method, Method::MAX);
         assert_eq!(scenario.network.listen, "tcp/127.0.0.1:0");
         assert_eq!(scenario.scene.rate, 1.0);
+    }
+
+    #[test]
+    fn fields_are_set_from_the_command_line_and_wrong_ones_are_named() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("s.yaml");
+        std::fs::write(&file, format!("{SMALL}vehicles: {{4288: {{codec: {{dtype: i8}}}}}}\n")).unwrap();
+        let read = |texts: &[&str]| {
+            let overrides: Vec<FieldOverride> = texts.iter().map(|text| text.parse().unwrap()).collect();
+            Scenario::read_with(&file, &overrides)
+        };
+        let scenario =
+            read(&["scene.lockstep=true", "agents.codec.dtype=f32", "vehicles.4288.codec.zstd_level=3"]).unwrap();
+        assert!(scenario.scene.lockstep && scenario.agents.codec.dtype == Dtype::F32);
+        let own = scenario.settings_of(&CavId::new("4288").unwrap()).codec;
+        assert_eq!((own.dtype, own.zstd_level), (Dtype::I8, Some(3)));
+        assert_eq!(scenario.scene.dir, without_dots(&folder.path().join("../scene")));
+        let message = read(&["scene.lockstep=maybe"]).unwrap_err().to_string();
+        assert!(message.contains("s.yaml") && message.contains("--set scene.lockstep=\"maybe\""), "{message}");
+        assert!(read(&["scene.lock=true"]).unwrap_err().to_string().contains("unknown field `lock`"));
     }
 
     #[test]

@@ -6,6 +6,7 @@
 
 mod check;
 mod error;
+mod field_override;
 pub mod fingerprint;
 mod load;
 mod overrides;
@@ -27,6 +28,7 @@ use serde::{Deserialize, Serialize};
 use sim_replay::config::{LinkSelection, RecordingConfig, SceneConfig};
 
 pub use error::ScenarioError;
+pub use field_override::FieldOverride;
 pub use overrides::AgentOverrides;
 
 use crate::scenario::fingerprint::Provenance;

@@ -5,9 +5,10 @@ use std::fmt::Write as _;
 use super::cell::Cell;
 use super::spec::Experiment;
 use super::table::{NOTES, rows};
+use super::varying::VaryingTable;
 
 const STYLE: &str = "body{font:16px/1.5 system-ui,sans-serif;margin:2rem auto;max-width:72rem;padding:0 1rem;\
-    color:#282c34}h1{font-size:1.5rem}h2{font-size:1.15rem;margin-top:2rem}svg{width:100%;height:auto}\
+    color:#282c34;overflow-wrap:anywhere}h1{font-size:1.5rem}h2{font-size:1.15rem;margin-top:2rem}svg{width:100%;min-width:34rem;height:auto}figure{margin:1rem 0;overflow-x:auto}\
     .wide{overflow-x:auto}table{border-collapse:collapse;font-size:.8rem;white-space:nowrap}\
     th,td{padding:.2rem .6rem;text-align:right;border-bottom:1px solid #e2e5ea}th{position:sticky;top:0;background:#fff}\
     pre{background:#f5f6f8;padding:1rem;overflow-x:auto;font-size:.85rem}dt{font-weight:600}dd{margin:0 0 .4rem 1rem}";
@@ -30,20 +31,17 @@ pub(super) fn page(experiment: &Experiment, spec: &str, cells: &[Cell], figures:
         cells.len(),
         escaped(&experiment.name)
     );
+    let (columns, lines) = rows(experiment, cells);
+    let columns: Vec<&str> = columns.iter().map(|column| column.trim()).collect();
+    let table = VaryingTable::new(&columns, &lines);
+    if let Some(sentence) = table.sentence() {
+        let _ = writeln!(page, "<p>{}</p>", escaped(&sentence));
+    }
     for figure in figures {
         let _ = writeln!(page, "<figure>{figure}</figure>");
     }
-    let (columns, lines) = rows(experiment, cells);
-    let cells_of = |tag: &str, fields: &mut dyn Iterator<Item = String>| {
-        fields.map(|field| format!("<{tag}>{}</{tag}>", escaped(&field))).collect::<String>()
-    };
-    page += "<h2>Runs</h2>\n<div class=\"wide\"><table><thead><tr>";
-    page += &cells_of("th", &mut columns.iter().map(|column| column.trim().to_owned()));
-    page += "</tr></thead><tbody>\n";
-    for line in lines {
-        let _ = writeln!(page, "<tr>{}</tr>", cells_of("td", &mut line.into_iter()));
-    }
-    page += "</tbody></table></div>\n<h2>Columns</h2>\n<dl>\n";
+    page += &runs_table(&table);
+    page += "<h2>Columns</h2>\n<dl>\n";
     for (column, note) in NOTES {
         let _ = writeln!(page, "<dt>{column}</dt><dd>{}</dd>", escaped(note));
     }
@@ -53,6 +51,28 @@ pub(super) fn page(experiment: &Experiment, spec: &str, cells: &[Cell], figures:
     }
     let _ = writeln!(page, "</ul>\n<h2>Experiment</h2>\n<pre>{}</pre>\n</body></html>", escaped(spec));
     page
+}
+
+/// The runs: what varies in a table, the best precisions in bold, and the rest in a line.
+fn runs_table(table: &VaryingTable) -> String {
+    let mut text = "<h2>Runs</h2>\n<div class=\"wide\"><table><thead><tr>".to_owned();
+    table.columns.iter().for_each(|column| text += &format!("<th>{}</th>", escaped(column)));
+    text += "</tr></thead><tbody>\n";
+    for (line, fields) in table.lines.iter().enumerate() {
+        text += "<tr>";
+        for (column, field) in fields.iter().enumerate() {
+            let field = escaped(field);
+            let field = if table.is_best(line, column) { format!("<b>{field}</b>") } else { field };
+            text += &format!("<td>{field}</td>");
+        }
+        text += "</tr>\n";
+    }
+    text += "</tbody></table></div>\n";
+    let constants: Vec<String> = table.constants.iter().map(|(name, value)| format!("{name} {value}")).collect();
+    if !constants.is_empty() {
+        text += &format!("<p>The same in all runs: {}.</p>\n", escaped(&constants.join(", ")));
+    }
+    text
 }
 
 /// Text with the special characters of markup escaped.

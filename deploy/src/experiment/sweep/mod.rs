@@ -10,6 +10,7 @@ mod grid;
 mod html;
 mod spec;
 mod table;
+mod varying;
 mod workers;
 
 use std::fs;

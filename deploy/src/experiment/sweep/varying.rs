@@ -1,0 +1,96 @@
+//! Columns of a sweep's table that vary, as its report shows them, and what is seen in them.
+
+/// Columns that are shown first, and in whose highest value a reader is interested.
+const PRECISIONS: [&str; 3] = ["ap_global_30", "ap_global_50", "ap_global_70"];
+/// The one that the sentence is about.
+const MAIN: &str = "ap_global_50";
+/// Last column that an experiment sets; those after it are results.
+const LAST_SETTING: &str = "seed";
+
+/// A table without the columns that are the same in every run.
+#[derive(Debug, PartialEq)]
+pub(super) struct VaryingTable {
+    pub(super) columns: Vec<String>,
+    pub(super) lines: Vec<Vec<String>>,
+    /// Name and value of the other columns that have one.
+    pub(super) constants: Vec<(String, String)>,
+    /// Number of the columns that the experiment sets.
+    settings: usize,
+}
+
+impl VaryingTable {
+    /// The varying settings, then precisions, then the other varying results.
+    pub(super) fn new(columns: &[&str], lines: &[Vec<String>]) -> Self {
+        let values = |place: usize| lines.iter().map(move |line| line.get(place).map_or("", String::as_str));
+        let varies = |place: usize| values(place).any(|value| Some(value) != values(place).next());
+        let settings = columns.iter().position(|column| *column == LAST_SETTING).map_or(0, |last| last + 1);
+        let is_shown = |place: &usize| varies(*place) || PRECISIONS.contains(&columns[*place]);
+        let (precisions, others): (Vec<usize>, Vec<usize>) =
+            (settings..columns.len()).filter(is_shown).partition(|&place| PRECISIONS.contains(&columns[place]));
+        let varied: Vec<usize> = (0..settings).filter(|&place| varies(place)).collect();
+        let kept: Vec<usize> = varied.iter().copied().chain(precisions).chain(others).collect();
+        let constant = |place: usize| {
+            let value = values(place).next().filter(|value| !value.is_empty())?;
+            Some((columns[place].to_owned(), value.to_owned()))
+        };
+        Self {
+            columns: kept.iter().map(|&place| columns[place].to_owned()).collect(),
+            lines: lines.iter().map(|line| kept.iter().map(|&place| line[place].clone()).collect()).collect(),
+            constants: (0..columns.len()).filter(|place| !kept.contains(place)).filter_map(constant).collect(),
+            settings: varied.len(),
+        }
+    }
+
+    /// True if a field is the highest of a column of precisions, where they differ.
+    pub(super) fn is_best(&self, line: usize, column: usize) -> bool {
+        PRECISIONS.contains(&self.columns[column].as_str())
+            && self.range(column).is_some_and(|(low, high)| low < high && self.number(line, column) == Some(high))
+    }
+
+    /// One sentence: the runs with the highest and the lowest AP@0.5.
+    pub(super) fn sentence(&self) -> Option<String> {
+        let column = self.columns.iter().position(|column| column == MAIN)?;
+        let (low, high) = self.range(column).filter(|(low, high)| low < high)?;
+        let run_with = |value: f64| (0..self.lines.len()).find(|&line| self.number(line, column) == Some(value));
+        let (best, worst) = (self.settings_of(run_with(high)?), self.settings_of(run_with(low)?));
+        Some(format!("AP@0.5 is between {low:.3} ({worst}) and {high:.3} ({best})."))
+    }
+
+    fn settings_of(&self, line: usize) -> String {
+        let pairs = self.columns.iter().zip(&self.lines[line]).take(self.settings);
+        pairs
+            .filter(|(_, value)| !value.is_empty())
+            .map(|(name, value)| format!("{name} {value}"))
+            .collect::<Vec<_>>()
+            .join(", ")
+    }
+
+    fn number(&self, line: usize, column: usize) -> Option<f64> {
+        self.lines[line][column].parse().ok()
+    }
+
+    fn range(&self, column: usize) -> Option<(f64, f64)> {
+        let numbers = (0..self.lines.len()).filter_map(|line| self.number(line, column));
+        numbers.map(|number| (number, number)).reduce(|(low, high), (number, _)| (low.min(number), high.max(number)))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_the_same_in_all_runs_is_said_once_and_the_best_run_is_named() {
+        let columns = ["method", "zstd", "loss", "seed", "frames", "ap_global_50", "e2e_ms_p50"];
+        let line = |fields: [&str; 7]| fields.map(str::to_owned).to_vec();
+        let lines =
+            [line(["max", "", "0", "1", "10", "0.9000", "31"]), line(["max", "", "0.1", "1", "10", "0.8000", "30"])];
+        let table = VaryingTable::new(&columns, &lines);
+        assert_eq!(table.columns, ["loss", "ap_global_50", "e2e_ms_p50"]);
+        let constants = [("method", "max"), ("seed", "1"), ("frames", "10")];
+        assert_eq!(table.constants, constants.map(|(name, value)| (name.to_owned(), value.to_owned())));
+        assert!(table.is_best(0, 1) && !table.is_best(1, 1) && !table.is_best(0, 2));
+        assert_eq!(table.sentence().unwrap(), "AP@0.5 is between 0.800 (loss 0.1) and 0.900 (loss 0).");
+        assert_eq!(VaryingTable::new(&columns, &lines[..1]).sentence(), None);
+    }
+}
