@@ -33,14 +33,16 @@ pub(crate) struct Unused {
     pub(crate) motions: usize,
 }
 
-/// Holds the newest sweep until its pose arrives, or is known to be lost; likewise its motion, but for vehicles without a
-/// motion sensor: after one sweep without a motion none is awaited until one arrives.
+/// Holds the newest sweep until its measured pose and motion arrive, or are known to be lost. Vehicles without a GNSS
+/// receiver or a motion sensor do not wait for them: after one sweep without a measurement none of its kind is awaited
+/// until one arrives.
 #[derive(Debug)]
 pub(crate) struct SweepPairing<S> {
     timeout: Duration,
     waiting: Option<(u64, S, Instant)>,
     poses: CaptureBuffer<Pose>,
     motions: CaptureBuffer<EgoMotion>,
+    expects_pose: bool,
     expects_motion: bool,
 }
 
@@ -53,6 +55,7 @@ impl<S> SweepPairing<S> {
             waiting: None,
             poses: CaptureBuffer::default(),
             motions: CaptureBuffer::default(),
+            expects_pose: true,
             expects_motion: true,
         }
     }
@@ -61,6 +64,7 @@ impl<S> SweepPairing<S> {
     /// Poses arrive in order, so a later one is left over from before the scene restarted.
     #[must_use]
     pub(crate) fn add_pose(&mut self, capture_nanos: u64, pose: Pose) -> usize {
+        self.expects_pose = true;
         self.poses.add(capture_nanos, pose)
     }
 
@@ -80,13 +84,14 @@ impl<S> SweepPairing<S> {
     /// The sweep, if there is nothing left to wait for.
     pub(crate) fn next(&mut self, now: Instant) -> Option<PairedSweep<S>> {
         let &(capture_nanos, _, since) = self.waiting.as_ref()?;
-        let is_awaited =
-            self.poses.is_awaited(capture_nanos) || self.expects_motion && self.motions.is_awaited(capture_nanos);
+        let is_awaited = self.expects_pose && self.poses.is_awaited(capture_nanos)
+            || self.expects_motion && self.motions.is_awaited(capture_nanos);
         if is_awaited && now < since + self.timeout {
             return None;
         }
         let (pose, poses) = self.poses.take(capture_nanos);
         let (motion, motions) = self.motions.take(capture_nanos);
+        self.expects_pose = pose.is_some() || !self.poses.0.is_empty();
         self.expects_motion = motion.is_some();
         let (_, sweep, _) = self.waiting.take()?;
         Some(PairedSweep { capture_nanos, sweep, pose, motion, unused: Unused { poses, motions } })
@@ -216,6 +221,19 @@ mod tests {
         assert_eq!(pairing.add_sweep(20, 'b', now), Some('a'));
         let gone: usize = (0..40).map(|k| pairing.add_pose(100 + k, at(0.0))).sum();
         assert_eq!(gone, 40 - MAX_MEASUREMENTS);
+    }
+
+    #[test]
+    fn a_vehicle_without_a_receiver_of_poses_waits_once() {
+        let (mut pairing, now) = (without_motion(), Instant::now());
+        assert_eq!(pairing.add_sweep(10, 'a', now), None);
+        assert_eq!(paired(&mut pairing, now), None, "there may be a receiver");
+        assert_eq!(paired(&mut pairing, now + TIMEOUT), Some((10, 'a', None, 0)));
+        assert_eq!(pairing.add_sweep(20, 'b', now), None);
+        assert_eq!(paired(&mut pairing, now), Some((20, 'b', None, 0)));
+        assert_eq!(pairing.add_pose(30, at(3.0)), 0);
+        assert_eq!(pairing.add_sweep(40, 'c', now), None);
+        assert_eq!(paired(&mut pairing, now), None, "there is one now");
     }
 
     #[test]

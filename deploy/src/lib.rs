@@ -5,9 +5,10 @@
 //! - [`operate`]: processes, network, keys, health, the run folder.
 //! - [`run`]: one run, live or in simulation time, and its metrics.
 //! - [`experiment`]: offline evaluation, tables, sweeps and reports.
+//! - [`ros`]: node of a ROS 2 network.
 //! - [`view`]: a page that shows a run, live or recorded, and its pictures.
 //!
-//! Each uses those before it in this list only; `view` uses `operate` and `score`.
+//! Each uses those before it in this list only; `view` uses `operate` and `score`, `ros` none.
 //!
 //! ```
 //! use deploy::scenario::Scenario;
@@ -23,6 +24,7 @@
 
 pub mod experiment;
 pub mod operate;
+pub mod ros;
 pub mod run;
 pub mod scenario;
 pub mod schema;

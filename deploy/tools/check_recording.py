@@ -42,8 +42,24 @@ def cloud(message):
 
 
 def pose(message):
-    return {"stamp_s": seconds(message.header.stamp), "frame": message.header.frame_id,
-            "position": xyz(message.pose.position), "wxyz": quaternion(message.pose.orientation)}
+    pose = message.pose.pose
+    return {"stamp_s": seconds(message.header.stamp), "frame": message.header.frame_id, "position": xyz(pose.position),
+            "wxyz": quaternion(pose.orientation), "covariance": list(message.pose.covariance)}
+
+
+def odometry(message):
+    return pose(message) | {"child": message.child_frame_id, "speed_mps": message.twist.twist.linear.x,
+                            "yaw_rate_rad_s": message.twist.twist.angular.z}
+
+
+def detections(message):
+    return [{"frame": d.header.frame_id, "class": d.results[0].hypothesis.class_id, "score": d.results[0].hypothesis.score,
+             "position": xyz(d.bbox.center.position), "wxyz": quaternion(d.bbox.center.orientation),
+             "size": xyz(d.bbox.size)} for d in message.detections]
+
+
+def diagnostics(message):
+    return [{"name": s.name, "message": s.message, "values": {v.key: v.value for v in s.values}} for s in message.status]
 
 
 def transforms(message):
@@ -57,8 +73,10 @@ def markers(message):
              "wxyz": quaternion(m.pose.orientation), "size": xyz(m.scale), "text": m.text} for m in shown]
 
 
-READERS = {"sensor_msgs/msg/PointCloud2": cloud, "geometry_msgs/msg/PoseStamped": pose,
-           "tf2_msgs/msg/TFMessage": transforms, "visualization_msgs/msg/MarkerArray": markers}
+READERS = {"sensor_msgs/msg/PointCloud2": cloud, "geometry_msgs/msg/PoseWithCovarianceStamped": pose,
+           "nav_msgs/msg/Odometry": odometry, "vision_msgs/msg/Detection3DArray": detections,
+           "diagnostic_msgs/msg/DiagnosticArray": diagnostics, "tf2_msgs/msg/TFMessage": transforms,
+           "visualization_msgs/msg/MarkerArray": markers}
 
 
 def main(path):

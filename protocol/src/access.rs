@@ -8,7 +8,8 @@
 //! | `replay` | sensors of every vehicle and previews of them, the truth, the end of the scene | control, readiness, detections |
 //! | `scorer` | control | the truth, detections, poses, statistics |
 //! | `recorder` | nothing | everything but previews |
-//! | `viewer` | nothing | results, previews of sweeps, statistics |
+//! | `viewer` | nothing | results, descriptors, previews of sweeps, images, statistics |
+//! | `ros2` | sweeps of every vehicle | sweeps, motion, poses, detections, statistics |
 //!
 //! In addition every process declares a liveliness token and publishes its readiness and its ledger, each under its own
 //! name.
@@ -44,7 +45,7 @@ pub struct Principal {
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum PrincipalError {
     /// The text begins with no role.
-    #[error("{0:?} is no principal: agent-<cav>, ego-<cav>, link-<cav>, replay, scorer, recorder or viewer")]
+    #[error("{0:?} is no principal: agent-<cav>, ego-<cav>, link-<cav>, replay, scorer, recorder, viewer or ros2")]
     Role(String),
     /// The role is not followed by a vehicle.
     #[error(transparent)]
@@ -113,10 +114,15 @@ impl Principal {
             }
             Role::Recorder => (Vec::new(), vec![keys(&"**")]),
             Role::Viewer => {
-                let shown = [Stream::Pose, Stream::Boxes, Stream::Detections, Stream::Preview];
+                let shown = [Stream::Pose, Stream::Boxes, Stream::Detections, Stream::Preview, Stream::Descriptor];
                 let shown = shown.iter().map(|stream| everyones(stream));
-                let rest = ["rx/*/*/pose", "truth", "stats/*", "control/*"].map(|topic| keys(&topic));
+                let rest = ["*/camera/*", "rx/*/*/pose", "truth", "stats/*", "control/*"].map(|topic| keys(&topic));
                 (Vec::new(), shown.chain(rest).collect::<Vec<_>>())
+            }
+            Role::Ros2 => {
+                let streams = [Stream::Lidar, Stream::Imu, Stream::Pose, Stream::Detections];
+                let subscribed = streams.iter().map(|stream| everyones(stream)).chain([keys(&"stats/*")]);
+                (vec![everyones(&Stream::Lidar)], subscribed.collect())
             }
         };
         let right = |act| move |keys: KeyExpr| Permission { act, keys };
@@ -135,7 +141,7 @@ impl Principal {
     fn watched(&self) -> Option<&'static str> {
         match self.role {
             Role::Ego | Role::Link => Some("alive/agent/*"),
-            Role::Scorer | Role::Viewer | Role::Recorder => Some("alive/*/*"),
+            Role::Scorer | Role::Viewer | Role::Recorder | Role::Ros2 => Some("alive/*/*"),
             Role::Agent | Role::Replay => None,
         }
     }
@@ -254,7 +260,9 @@ mod tests {
 
     #[test]
     fn principals_are_written_and_read_back() {
-        for text in ["agent-4279", "agent--1", "ego-4279", "link-4279", "replay", "scorer", "recorder", "viewer"] {
+        for text in
+            ["agent-4279", "agent--1", "ego-4279", "link-4279", "replay", "scorer", "recorder", "viewer", "ros2"]
+        {
             let principal: Principal = text.parse().unwrap();
             assert_eq!((principal.to_string().as_str(), principal.name().as_str()), (text, text));
         }

@@ -174,10 +174,22 @@ impl KeyExpr {
         Self(format!("{KEY_ROOT}/{run}/{UNDECLARED}"))
     }
 
+    /// One key.
+    #[must_use]
+    pub fn one(key: &Key) -> Self {
+        Self(key.to_string())
+    }
+
     /// One stream of every vehicle, before the link.
     #[must_use]
     pub fn stream(run: &RunId, stream: Stream) -> Self {
         Self(format!("{KEY_ROOT}/{run}/*/{stream}"))
+    }
+
+    /// The images of all cameras of every vehicle.
+    #[must_use]
+    pub fn cameras(run: &RunId) -> Self {
+        Self(format!("{KEY_ROOT}/{run}/*/camera/*"))
     }
 
     /// One stream of every vehicle as it reaches `ego` over the link.

@@ -42,6 +42,7 @@
 //! | message | stream or key | from | to |
 //! | --- | --- | --- | --- |
 //! | [`Lidar`], [`Radar`] | `lidar`, `radar` | replay | that vehicle's agent |
+//! | [`Camera`] | `camera/<k>` | replay | viewers, recorders |
 //! | [`Gnss`] | `gnss` | replay | that vehicle's agent |
 //! | [`PoseEstimate`] | `pose` | agent | ego-fusers |
 //! | [`Bev`] | `bev` | agent | ego-fusers (intermediate fusion) |
@@ -123,10 +124,10 @@ pub use key::{Key, KeyError, KeyExpr};
 pub use ledger::{Account, Counts, Ledger};
 pub use limits::Limits;
 pub use message::{
-    AgentTruth, Bev, Boxes, Control, Descriptor, Detections, DetectionsReport, EgoMotion, FusedNeighbour, Gnss,
-    GnssSource, Kind, Lidar, Message, ModelHash, NeighbourState, NoPoseReason, Pace, Payload, PlanarCovariance, Points,
-    PoseEstimate, ProcessUsage, Radar, SkippedNeighbour, StageSummary, StageTiming, Stats, TopicCount, TopicTraffic,
-    TrueObject, Truth,
+    AgentTruth, Bev, Boxes, Camera, CameraMetadata, Control, Descriptor, Detections, DetectionsReport, EgoMotion,
+    FusedNeighbour, Gnss, GnssSource, ImageFormat, Kind, Lidar, Message, ModelHash, NeighbourState, NoPoseReason, Pace,
+    Payload, Pinhole, PlanarCovariance, Points, PoseEstimate, ProcessUsage, Radar, SkippedNeighbour, StageSummary,
+    StageTiming, Stats, TopicCount, TopicTraffic, TrueObject, Truth,
 };
 pub use misbehaviour_reason::MisbehaviourReason;
 pub use point_cloud::{Handedness, PointCloud};

@@ -53,6 +53,7 @@ impl Stream {
             Self::Lidar | Self::Preview => Kind::Lidar,
             Self::Gnss => Kind::Gnss,
             Self::Imu => Kind::Imu,
+            Self::Camera(_) => Kind::Camera,
             Self::Radar => Kind::Radar,
             Self::Pose => Kind::Pose,
             Self::Bev => Kind::Bev,
@@ -61,7 +62,7 @@ impl Stream {
             Self::Pace => Kind::Pace,
             Self::Descriptor => Kind::Descriptor,
             Self::Detections => Kind::Detections,
-            Self::Camera(_) | Self::DetectionsJson => return None,
+            Self::DetectionsJson => return None,
         })
     }
 

@@ -32,6 +32,8 @@ named! {
         Recorder = "recorder",
         /// Shows the run to people.
         Viewer = "viewer",
+        /// Connects the run to a ROS 2 network.
+        Ros2 = "ros2",
     }
 }
 

@@ -160,6 +160,7 @@ fn smaller_limits_are_kept_too() {
             Message::Radar(_) | Message::Points(_) | Message::Boxes(_) | Message::Bev(_) => true,
             Message::Descriptor(_) | Message::Detections(_) | Message::Truth(_) | Message::Stats(_) => true,
             Message::Control(protocol::Control::End { .. } | protocol::Control::Ready { .. }) => true,
+            Message::Camera(_) => false,
             Message::Control(_) | Message::Gnss(_) | Message::Imu(_) | Message::Pace(_) | Message::Pose(_) => false,
         };
         match wire::decode_any([&bytes[..]], &limits) {

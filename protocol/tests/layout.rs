@@ -6,10 +6,11 @@ use protocol::{Compression, HEADER_LEN, Message, wire};
 
 /// Kind, length and FNV-1a of each sample in order. Maps compressed by zstd are omitted, as their bytes depend on the
 /// version of zstd. (A CRC is not usable here: over data that end in their own CRC it is constant.)
-const PINNED: [(&str, usize, u64); 32] = [
+const PINNED: [(&str, usize, u64); 33] = [
     ("lidar", 1693, 0x4120_a970_ce7d_6541),
     ("lidar", 93, 0xbef7_3984_f99b_c609),
     ("radar", 1693, 0x8acc_1614_26da_860e),
+    ("camera", 389, 0x077c_0158_1239_a20a),
     ("pace", 102, 0xa290_9e67_f48a_b5f1),
     ("imu", 102, 0xb6fd_95f9_b18c_2aa6),
     ("gnss", 165, 0xb831_6fe7_9510_84f1),

@@ -14,7 +14,7 @@ use crate::command;
 #[command(
     version,
     after_help = "Exit codes: 0 done, 1 failed, 2 bad usage or input, 3 finished but data was lost (convert, stream: frames \
-                  that cannot be read; stream: ticks that are not answered; record and recover: messages that are \
+                  that cannot be read; stream: ticks that are not answered; record, recover and export: messages that are \
                   missing; link: messages that never arrive)."
 )]
 pub(crate) struct Cli {
@@ -25,6 +25,7 @@ pub(crate) struct Cli {
 #[derive(Debug, Subcommand)]
 enum Command {
     Convert(command::convert::Args),
+    Export(command::export::Args),
     Inspect(command::inspect::Args),
     Link(Box<command::link::Args>),
     Record(command::record::Args),
@@ -37,6 +38,7 @@ enum Command {
 pub(crate) fn run(cli: Cli) -> ExitCode {
     let outcome = match cli.command {
         Command::Convert(args) => command::convert::run(&args),
+        Command::Export(args) => command::export::run(&args),
         Command::Inspect(args) => command::inspect::run(&args),
         Command::Link(args) => command::link::run(*args),
         Command::Record(args) => command::record::run(args),

@@ -1,6 +1,7 @@
 //! Offline work on localization: training and evaluation on recorded or generated scenes.
 //!
 //! - [`training`]: encoder, scene-specific heads and end-to-end networks.
+//! - [`icp_map`], [`sweep_database`]: what localizers without training start from.
 //! - [`evaluation`]: errors, confidence and times of a localizer over a data set.
 //!
 //! The vehicle's process does not link this crate, and with it none of the data-set readers.
@@ -26,4 +27,5 @@
 
 pub mod evaluation;
 pub mod icp_map;
+pub mod sweep_database;
 pub mod training;

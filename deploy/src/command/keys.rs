@@ -42,7 +42,7 @@ impl Arguments {
         principals
             .extend(self.egos.iter().flat_map(|cav| [Role::Ego, Role::Link].map(|role| Principal::new(role, cav))));
         // Vehicles that are added later join a fleet whose other processes have certificates already.
-        let others = [Role::Replay, Role::Scorer, Role::Recorder, Role::Viewer].map(Principal::of_role);
+        let others = [Role::Replay, Role::Scorer, Role::Recorder, Role::Viewer, Role::Ros2].map(Principal::of_role);
         let has_own = |principal: &Principal| self.out.join(principal.to_string()).exists();
         principals.extend(others.into_iter().filter(|principal| self.force || !has_own(principal)));
         let mut plan = KeyPlan::new(&self.out, principals, self.days);

@@ -5,6 +5,7 @@ mod demo;
 mod eval;
 mod keys;
 mod report;
+mod ros2;
 mod router;
 mod schema;
 mod status;
@@ -40,6 +41,9 @@ pub(crate) enum Command {
     Eval(Box<eval::Arguments>),
     /// Make a test authority and certificates for the processes of a fleet.
     Keys(keys::Arguments),
+    /// Connect a run with a ROS 2 network through rmw_zenoh: poses, odometry, detections, clouds, transforms and
+    /// diagnoses; and LiDARs of the network with the agents of the run.
+    Ros2(Box<ros2::Arguments>),
     /// Run the router of a fleet whose processes are on several hosts, or write the configuration of a zenohd in its
     /// place.
     Router(router::Arguments),
@@ -70,6 +74,7 @@ impl Command {
             Self::Status(arguments) => arguments.run(),
             Self::Keys(arguments) => arguments.run(),
             Self::Report(arguments) => arguments.run(),
+            Self::Ros2(arguments) => arguments.run(),
             Self::Router(arguments) => arguments.run(),
             Self::Schema(arguments) => arguments.run(),
             Self::Sweep(arguments) => arguments.run(),

@@ -162,7 +162,7 @@ impl Fleet {
     pub(crate) fn parties(&self) -> Vec<Principal> {
         let agents = self.agents.iter().map(|cav| Principal::new(Role::Agent, cav));
         let egos = [Role::Ego, Role::Link].map(|role| Principal::new(role, &self.ego));
-        let others = [Role::Replay, Role::Scorer, Role::Recorder, Role::Viewer].map(Principal::of_role);
+        let others = [Role::Replay, Role::Scorer, Role::Recorder, Role::Viewer, Role::Ros2].map(Principal::of_role);
         agents.chain(egos).chain(others).collect()
     }
 

@@ -28,7 +28,7 @@ fn try_draw(fleet: &Fleet, frame: &JudgedFrame, path: &Path) -> Result<(), Box<d
     let name = fleet.scenario.scene.scenario.as_deref();
     let scenario = dataset.scenarios.iter().find(|known| Some(known.name.as_str()) == name);
     let scenario = scenario.ok_or("the scene is gone")?;
-    let options = LoadOptions { lidar_variant: fleet.scenario.scene.variant.clone(), points: true, radar: false };
+    let options = LoadOptions { lidar_variant: fleet.scenario.scene.variant.clone(), ..LoadOptions::default() };
     let shown = std::iter::once(&fleet.ego).chain(frame.result.fused.iter().map(|neighbour| &neighbour.cav));
     let mut loaded = Vec::new();
     for cav in shown {

@@ -24,4 +24,5 @@ pub use neighbours::NeighbourRecord;
 pub use node::{ProcessStats, Progress, Scored, ScorerError};
 pub(crate) use node::{ScorerNode, scorer_cav};
 pub(crate) use stage_stamps::StageStamps;
+pub(crate) use true_boxes::true_objects;
 pub use truth_line::TruthLine;

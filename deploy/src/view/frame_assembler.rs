@@ -3,10 +3,11 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use protocol::{
-    Box3d, Boxes, CavId, Detection, Detections, Header, Ledger, Lidar, Limits, Payload, Pose, PoseEstimate,
+    Box3d, Boxes, CavId, Descriptor, Detection, Detections, Header, Ledger, Lidar, Limits, Payload, Pose, PoseEstimate,
     StageSummary, Stats, Stream, Topic, TrueObject, Truth, wire,
 };
 
+use super::judgement::{DetectionArea, Judge, Judgement};
 use super::pace_counter::{PaceCounter, ShownPace};
 use super::scene_frame::{Link, Messages, POINT_BYTES, Planar, Process, SceneFrame, ShownBox, Vehicle, decimate};
 
@@ -41,6 +42,9 @@ pub(crate) struct FrameAssembler {
     /// Vehicles with at least one message.
     vehicles: BTreeSet<CavId>,
     pace: PaceCounter,
+    /// Area in which each vehicle detects, from its descriptor.
+    areas: BTreeMap<CavId, DetectionArea>,
+    judge: Judge,
 }
 
 /// Messages of one scene frame.
@@ -66,6 +70,11 @@ struct Arrival {
 }
 
 impl FrameAssembler {
+    /// An assembler that knows in which area each vehicle detects.
+    pub(crate) fn with_areas(areas: BTreeMap<CavId, DetectionArea>) -> Self {
+        Self { areas, ..Self::default() }
+    }
+
     /// Adds a message. A result completes its scene frame, which is returned; so is a scene frame without a result when
     /// too many wait. Invalid messages are ignored here and counted by their receivers.
     pub(crate) fn add(&mut self, seen: &ReceivedMessage<'_>) -> Option<SceneFrame> {
@@ -76,6 +85,12 @@ impl FrameAssembler {
         if let Topic::Stream { cav, .. } | Topic::Received { cav, .. } = seen.topic
             && !self.admits(cav)
         {
+            return None;
+        }
+        if let Topic::Stream { cav, stream: Stream::Descriptor } = seen.topic {
+            if let Some(Descriptor { grid, .. }) = decode(seen) {
+                self.areas.insert(cav.clone(), DetectionArea::from(&grid));
+            }
             return None;
         }
         if *seen.topic == Topic::Truth {
@@ -109,13 +124,15 @@ impl FrameAssembler {
         let ticks = closed.values().chain([&frame]).filter(|frame| frame.truth.is_some());
         ticks.for_each(|frame| self.pace.tick(frame.result.as_ref().map(|(published, _)| *published)));
         self.shown_until = Some(capture_nanos);
-        let shown = frame.frame(capture_nanos, &self.ledgers);
-        Some(SceneFrame { pace: self.pace.pace(), ..shown })
+        let area = frame.result.as_ref().and_then(|(_, result)| self.areas.get(&result.ego)).copied();
+        let judgement = frame.judged(area.as_ref(), &mut self.judge);
+        let shown = frame.frame(capture_nanos, &self.ledgers, &judgement);
+        Some(SceneFrame { pace: self.pace.pace(), area, ap_50: self.judge.average_precision(), ..shown })
     }
 
-    /// Forgets which scene frames were shown: a recording is shown in any order.
+    /// Forgets which scene frames were shown: a recording is shown in any order. Detection areas hold for all of it.
     pub(crate) fn rewind(&mut self) {
-        *self = Self::default();
+        *self = Self { areas: std::mem::take(&mut self.areas), ..Self::default() };
     }
 
     fn keep_ledger(&mut self, seen: &ReceivedMessage<'_>) {
@@ -199,7 +216,20 @@ fn decode<M: Payload>(seen: &ReceivedMessage<'_>) -> Option<M> {
 }
 
 impl OpenFrame {
-    fn frame(&self, capture_nanos: u64, ledgers: &BTreeMap<String, (Ledger, Vec<StageSummary>)>) -> SceneFrame {
+    /// The judgement of the result; empty without truth, result or area.
+    fn judged(&self, area: Option<&DetectionArea>, judge: &mut Judge) -> Judgement {
+        match (&self.result, &self.truth, area) {
+            (Some((_, result)), Some((_, truth)), Some(area)) => judge.judge(result, truth, area),
+            _ => Judgement::default(),
+        }
+    }
+
+    fn frame(
+        &self,
+        capture_nanos: u64,
+        ledgers: &BTreeMap<String, (Ledger, Vec<StageSummary>)>,
+        judgement: &Judgement,
+    ) -> SceneFrame {
         let result = self.result.as_ref().map(|(_, result)| result);
         let (vehicles, points) = self.vehicles();
         let began = self.truth.as_ref().map(|(began, _)| *began);
@@ -214,12 +244,14 @@ impl OpenFrame {
             swept_ms: None,
             posed_ms: posed.and_then(since_began_ms),
             vehicles,
-            truth: self.true_boxes(),
-            detections: self.detections(),
+            truth: self.true_boxes(judgement),
+            detections: self.detections(judgement),
             single: self.single(),
             links: self.links(),
             stages: result.map_or(Vec::new(), |result| result.stages.clone()),
             pace: ShownPace::default(),
+            area: None,
+            ap_50: None,
             processes: ledgers
                 .iter()
                 .map(|(process, (_, stages))| Process { process: process.clone(), stages: stages.clone() })
@@ -264,6 +296,7 @@ impl OpenFrame {
             cav: cav.clone(),
             pose: pose.map(Planar::of),
             confidence: pose.and(estimate).map(PoseEstimate::confidence),
+            covariance_m2: estimate.and_then(PoseEstimate::covariance).map(|of| [of.xx_m2, of.xy_m2, of.yy_m2]),
             no_pose: match estimate {
                 Some(PoseEstimate::NoPose { reason, .. }) => Some(*reason),
                 _ => None,
@@ -281,12 +314,17 @@ impl OpenFrame {
         decoded.map_or(Vec::new(), |(_, Lidar { points })| decimate(&points))
     }
 
-    fn true_boxes(&self) -> Vec<ShownBox> {
+    fn true_boxes(&self, judgement: &Judgement) -> Vec<ShownBox> {
         let mut objects: BTreeMap<i64, &TrueObject> = BTreeMap::new();
         for object in self.truth.iter().flat_map(|(_, truth)| truth.agents.iter().flat_map(|agent| &agent.objects)) {
             objects.entry(object.id).or_insert(object);
         }
         let shown = |object: &TrueObject| ShownBox {
+            id: Some(object.id),
+            is_counted: judgement.found.contains_key(&object.id),
+            found_score: judgement.found.get(&object.id).copied().flatten(),
+            is_hit: None,
+            speed_mps: object.speed_mps,
             box3d: Box3d {
                 center_m: object.world_from_object.translation_m,
                 size_m: object.size_m,
@@ -300,9 +338,11 @@ impl OpenFrame {
     }
 
     /// The ego's detections, placed by its estimated pose.
-    fn detections(&self) -> Vec<ShownBox> {
+    fn detections(&self, judgement: &Judgement) -> Vec<ShownBox> {
         let Some((_, result)) = &self.result else { return Vec::new() };
-        self.placed(&result.ego, &result.pose, &result.detections, None)
+        let mut shown = self.placed(&result.ego, &result.pose, &result.detections, None);
+        shown.iter_mut().zip(&judgement.hits).for_each(|(shown, is_hit)| shown.is_hit = Some(*is_hit));
+        shown
     }
 
     /// Detections that single vehicles sent.
@@ -321,6 +361,11 @@ impl OpenFrame {
             score: Some(detection.score),
             source: source.or(detection.source.as_ref()).cloned(),
             class: None,
+            id: None,
+            is_counted: false,
+            found_score: None,
+            is_hit: None,
+            speed_mps: None,
         };
         found.iter().map(shown).collect()
     }

@@ -1,7 +1,8 @@
 //! Live run: follows the newest scene frame.
 
-use std::sync::Arc;
+use std::collections::BTreeSet;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
@@ -9,11 +10,14 @@ use bus::bounded_queue::Pop;
 use bus::{Bus, BusError, PassiveSubscriber, RawMessage};
 use bytes::Bytes;
 use futures_util::{Stream as Pieces, stream};
-use protocol::{KeyExpr, Kind, RunId, Stream, wire};
+use protocol::{KeyExpr, Kind, RunId, Stream, Topic, Verb, wire};
+use serde::Serialize;
 use tokio::sync::watch;
 use tokio::time::{sleep, timeout};
+use zenoh::Wait;
 
 use super::frame_assembler::{FrameAssembler, ReceivedMessage};
+use super::images::NewestImages;
 
 /// Largest number of waiting messages of one key.
 const PLACES: usize = 4;
@@ -34,8 +38,31 @@ pub struct LiveRun {
     /// Newest scene frame after its length; empty: none so far.
     newest: Arc<watch::Sender<Bytes>>,
     run: RunId,
+    activity: Arc<Mutex<RunActivity>>,
+    images: Arc<NewestImages>,
     ending: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
+}
+
+/// What is known of a live run besides its frames.
+#[derive(Debug, Clone, Serialize)]
+pub(super) struct RunStatus {
+    /// Time since the last message, seconds; `None`: there was none since a page is open.
+    pub(super) silent_s: Option<f64>,
+    /// True if its scene has been played to the end.
+    pub(super) is_over: bool,
+    /// True while there is a connection to its router.
+    pub(super) has_router: bool,
+    /// Numbers of the cameras whose images have arrived.
+    pub(super) cameras: BTreeSet<u8>,
+}
+
+/// State behind [`RunStatus`].
+#[derive(Debug, Default)]
+struct RunActivity {
+    last_message: Option<Instant>,
+    is_over: bool,
+    has_router: bool,
 }
 
 impl LiveRun {
@@ -47,24 +74,43 @@ impl LiveRun {
         let run = bus.identity().run.clone();
         let newest = Arc::new(watch::Sender::default());
         let ending = Arc::<AtomicBool>::default();
+        let (activity, images) = (Arc::default(), Arc::default());
         let listener = Listener {
             bus,
             run: run.clone(),
             newest: Arc::clone(&newest),
             ending: Arc::clone(&ending),
             assembly: FrameAssembler::default(),
+            activity: Arc::clone(&activity),
+            images: Arc::clone(&images),
         };
         let thread = thread::Builder::new()
             .name("view".into())
             .spawn(move || listener.run())
             .map_err(|cause| BusError::Thread { what: "the view".into(), cause })?;
-        Ok(Self { newest, run, ending, thread: Some(thread) })
+        Ok(Self { newest, run, activity, images, ending, thread: Some(thread) })
     }
 
     /// Name of the run.
     #[must_use]
     pub fn name(&self) -> &str {
         self.run.as_str()
+    }
+
+    /// State of the run.
+    pub(super) fn status(&self) -> RunStatus {
+        let activity = self.activity.lock().unwrap_or_else(PoisonError::into_inner);
+        RunStatus {
+            silent_s: activity.last_message.map(|at| at.elapsed().as_secs_f64()),
+            is_over: activity.is_over,
+            has_router: activity.has_router,
+            cameras: self.images.cameras(),
+        }
+    }
+
+    /// Newest images of the cameras.
+    pub(super) fn images(&self) -> &NewestImages {
+        &self.images
     }
 
     /// Number of open pages.
@@ -112,6 +158,8 @@ struct Listener {
     newest: Arc<watch::Sender<Bytes>>,
     ending: Arc<AtomicBool>,
     assembly: FrameAssembler,
+    activity: Arc<Mutex<RunActivity>>,
+    images: Arc<NewestImages>,
 }
 
 /// Subscriptions while a page is open.
@@ -122,9 +170,10 @@ struct Subscriptions {
 
 impl Subscriptions {
     fn open(bus: &Bus, run: &RunId) -> Result<Self, BusError> {
-        let streams = [Stream::Pose, Stream::Boxes, Stream::Detections];
+        let streams = [Stream::Pose, Stream::Boxes, Stream::Detections, Stream::Descriptor];
         let mut selectors: Vec<KeyExpr> = streams.map(|stream| KeyExpr::stream(run, stream)).into();
         selectors.extend([KeyExpr::received_by_anyone(run, Stream::Pose), KeyExpr::truth(run), KeyExpr::stats(run)]);
+        selectors.push(KeyExpr::control(run));
         let previews = bus.tap(&[KeyExpr::stream(run, Stream::Preview)], PREVIEW_PLACES)?;
         Ok(Self { previews, rest: bus.tap(&selectors, PLACES)? })
     }
@@ -133,9 +182,11 @@ impl Subscriptions {
 impl Listener {
     fn run(mut self) {
         let mut ears: Option<Subscriptions> = None;
+        let mut cameras: Option<PassiveSubscriber> = None;
         while !self.ending.load(Ordering::Relaxed) {
+            self.watch_router();
             if !self.is_watched() {
-                ears = None;
+                (ears, cameras) = (None, None);
                 thread::sleep(CHECK_PERIOD);
                 continue;
             }
@@ -149,6 +200,7 @@ impl Listener {
                 }
                 continue;
             };
+            self.follow_cameras(&mut cameras);
             // Previews first: a scene frame is shown when its result is taken, and its sweeps have arrived long before.
             if let Pop::Item(_, message) = rest.take(Some(Instant::now() + CHECK_PERIOD)) {
                 while let Pop::Item(_, preview) = previews.take(Some(Instant::now())) {
@@ -163,17 +215,55 @@ impl Listener {
         }
     }
 
+    fn watch_router(&self) {
+        let has_router = self.bus.session().info().routers_zid().wait().next().is_some();
+        self.activity().has_router = has_router;
+    }
+
+    fn activity(&self) -> MutexGuard<'_, RunActivity> {
+        self.activity.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Receives images only while a page shows them: they are the largest stream after sweeps.
+    fn follow_cameras(&self, cameras: &mut Option<PassiveSubscriber>) {
+        if !self.images.are_wanted() {
+            *cameras = None;
+            return;
+        }
+        if cameras.is_none() {
+            match self.bus.tap(&[KeyExpr::cameras(&self.run)], PREVIEW_PLACES) {
+                Ok(opened) => *cameras = Some(opened),
+                Err(error) => tracing::error!("no images are shown: {error}"),
+            }
+        }
+        let Some(cameras) = cameras else { return };
+        while let Pop::Item(_, message) = cameras.take(Some(Instant::now())) {
+            self.images.keep(&message.key.topic, &message.bytes());
+        }
+    }
+
     fn is_watched(&self) -> bool {
         self.newest.receiver_count() > 0
+    }
+
+    fn note(&self, topic: &Topic) {
+        let mut activity = self.activity();
+        activity.last_message = Some(Instant::now());
+        match topic {
+            Topic::Control(Verb::End) => activity.is_over = true,
+            Topic::Truth => activity.is_over = false,
+            _ => {}
+        }
     }
 
     fn take(&mut self, message: &RawMessage) {
         let bytes = message.bytes();
         let Ok(header) = wire::decode_header([bytes.as_ref()]) else { return };
+        let topic = &message.key.topic;
+        self.note(topic);
         if header.kind == Kind::Control {
             return;
         }
-        let topic = &message.key.topic;
         let (arrived_nanos, payload) = (message.arrived_nanos, Some(bytes.as_ref()));
         let seen = ReceivedMessage { topic, header: &header, arrived_nanos, payload };
         if let Some(frame) = self.assembly.add(&seen).filter(|_| self.is_watched()) {

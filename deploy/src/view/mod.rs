@@ -5,6 +5,8 @@
 //! same `FrameAssembler`, which returns [`SceneFrame`]s.
 
 mod frame_assembler;
+mod images;
+mod judgement;
 mod live;
 mod pace_counter;
 pub mod picture;
@@ -14,6 +16,7 @@ mod server;
 #[cfg(test)]
 mod tests;
 
+pub use judgement::DetectionArea;
 pub use live::LiveRun;
 pub use pace_counter::ShownPace;
 pub use recorded::{RecordedRun, ViewError};

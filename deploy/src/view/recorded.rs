@@ -1,14 +1,16 @@
 //! Recorded run: random access to its scene frames.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 
-use protocol::{Detections, Limits, PoseEstimate, Stream, Topic, Truth, wire};
+use bytes::Bytes;
+use protocol::{Camera, CavId, Descriptor, Detections, ImageFormat, Limits, PoseEstimate, Stream, Topic, Truth, wire};
 use recording::{Entry, Recording, RecordingError};
 use serde::Serialize;
 
 use super::frame_assembler::{FrameAssembler, ReceivedMessage};
+use super::judgement::{DetectionArea, Judge};
 use super::pace_counter::PaceCounter;
 use super::scene_frame::SceneFrame;
 use crate::operate::run_folder::{RECORDING, SWEEP_LOG};
@@ -26,6 +28,9 @@ pub enum ViewError {
     #[error("{}: no truth and no detections in it", .0.display())]
     Empty(PathBuf),
 }
+
+/// Score from which detections are shown and counted at first.
+const SHOWN_SCORE: f32 = 0.2;
 
 /// A run in a file.
 pub struct RecordedRun {
@@ -58,6 +63,10 @@ pub(crate) struct MomentSummary {
     pub latency_ms: Option<f64>,
     /// Number of detected boxes.
     pub detected: usize,
+    /// True positives, false positives and missed objects at a score of 0.2; `None` if that is not known.
+    pub judged: Option<[usize; 3]>,
+    /// Average precision at an IoU of 0.5 until this frame.
+    pub ap_50: Option<f64>,
     /// Number of fused neighbours.
     pub fused: usize,
     /// Distance of the ego's pose from the truth, metres.
@@ -80,12 +89,17 @@ impl RecordedRun {
         }
         let name = recording.entries().first().map_or(String::new(), |entry| entry.key.run.to_string());
         let mut moments = BTreeMap::<u64, Vec<usize>>::new();
-        let mut stats = Vec::new();
+        let (mut stats, mut areas) = (Vec::new(), BTreeMap::new());
         for (index, entry) in recording.entries().iter().enumerate() {
             match &entry.key.topic {
                 Topic::Stats(_) => stats.push(index),
-                Topic::Stream { stream: Stream::Descriptor, .. }
-                | Topic::Received { stream: Stream::Descriptor, .. } => {}
+                Topic::Stream { cav, stream: Stream::Descriptor } => {
+                    let bytes = recording.read(entry)?;
+                    if let Ok((_, descriptor)) = wire::decode::<Descriptor>([bytes.as_slice()], &Limits::DEFAULT) {
+                        areas.insert(cav.clone(), DetectionArea::from(&descriptor.grid));
+                    }
+                }
+                Topic::Received { stream: Stream::Descriptor, .. } => {}
                 Topic::Stream { .. } | Topic::Received { .. } | Topic::Truth => {
                     moments.entry(entry.header.stamp.capture_nanos).or_default().push(index);
                 }
@@ -93,10 +107,11 @@ impl RecordedRun {
             }
         }
         let swept = agent::sweep_log::read(&file.with_file_name(SWEEP_LOG)).unwrap_or_default();
-        let (pace, assembly) = (PaceCounter::default(), Mutex::default());
+        let (pace, mut judge) = (PaceCounter::default(), Judge::default());
+        let assembly = Mutex::new(FrameAssembler::with_areas(areas.clone()));
         let mut run = Self { recording, name, moments: Vec::new(), swept, stats, pace, assembly };
         for (capture_nanos, entries) in moments {
-            if let Some(summary) = run.summary(capture_nanos, &entries)? {
+            if let Some(summary) = run.summary(capture_nanos, &entries, &areas, &mut judge)? {
                 let truth = entries.iter().map(|index| run.entry(*index)).find(|entry| entry.key.topic == Topic::Truth);
                 let began_nanos = truth.map(|entry| entry.header.stamp.publish_nanos);
                 if let Some(began) = began_nanos {
@@ -156,10 +171,39 @@ impl RecordedRun {
         Ok(assembly.show(moment.capture_nanos).map(|frame| self.with_sweep(frame, moment)))
     }
 
+    /// The image of a camera at a scene frame; `None` if there is none.
+    ///
+    /// # Errors
+    /// [`RecordingError`] when the file has changed.
+    pub(super) fn image(
+        &self,
+        index: usize,
+        cav: &CavId,
+        number: u8,
+    ) -> Result<Option<(ImageFormat, Bytes)>, RecordingError> {
+        let topic = Topic::Stream { cav: cav.clone(), stream: Stream::Camera(number) };
+        let entries = self.moments.get(index).into_iter().flat_map(|moment| &moment.entries);
+        let Some(entry) = entries.map(|entry| self.entry(*entry)).find(|entry| entry.key.topic == topic) else {
+            return Ok(None);
+        };
+        let bytes = self.recording.read(entry)?;
+        let decoded = wire::decode::<Camera>([bytes.as_slice()], &Limits::DEFAULT).ok();
+        Ok(decoded.map(|(_, Camera { metadata, image })| (metadata.format, image.into())))
+    }
+
+    /// Numbers of the cameras of any vehicle.
+    pub(super) fn cameras(&self) -> BTreeSet<u8> {
+        let numbers = self.recording.entries().iter().filter_map(|entry| match entry.key.topic {
+            Topic::Stream { stream: Stream::Camera(number), .. } => Some(number),
+            _ => None,
+        });
+        numbers.collect()
+    }
+
     fn with_sweep(&self, frame: SceneFrame, moment: &Moment) -> SceneFrame {
         let swept = self.swept.get(&moment.capture_nanos).zip(moment.began_nanos);
         let swept_ms = swept.map(|(swept, began)| (*swept as f64 - began as f64) / 1e6);
-        SceneFrame { swept_ms, pace: self.pace.pace(), ..frame }
+        SceneFrame { swept_ms, pace: self.pace.pace(), ap_50: moment.summary.ap_50, ..frame }
     }
 
     fn entry(&self, index: usize) -> &Entry {
@@ -176,7 +220,13 @@ impl RecordedRun {
     }
 
     /// `None` if there is neither truth nor result.
-    fn summary(&self, capture_nanos: u64, entries: &[usize]) -> Result<Option<MomentSummary>, RecordingError> {
+    fn summary(
+        &self,
+        capture_nanos: u64,
+        entries: &[usize],
+        areas: &BTreeMap<CavId, DetectionArea>,
+        judge: &mut Judge,
+    ) -> Result<Option<MomentSummary>, RecordingError> {
         let mut summary = MomentSummary { capture_s: capture_nanos as f64 / 1e9, ..MomentSummary::default() };
         let (mut truth, mut result) = (None, None);
         for entry in entries.iter().map(|index| self.entry(*index)) {
@@ -200,8 +250,11 @@ impl RecordedRun {
             if let Some((began, truth)) = &truth {
                 summary.latency_ms = Some((*done as f64 - *began as f64) / 1e6);
                 summary.ego_error_m = ego_error_m(&result.pose, truth, result);
+                let area = areas.get(&result.ego);
+                summary.judged = area.map(|area| judge.judge(result, truth, area).counts(result, SHOWN_SCORE));
             }
         }
+        summary.ap_50 = judge.average_precision();
         Ok((truth.is_some() || result.is_some()).then_some(summary))
     }
 }

@@ -7,6 +7,7 @@ use protocol::{
 };
 use serde::{Serialize, Serializer};
 
+use super::judgement::DetectionArea;
 use super::pace_counter::ShownPace;
 
 /// Largest number of points of one sweep on the page: more than a screen has pixels for them.
@@ -48,6 +49,10 @@ pub struct SceneFrame {
     pub stages: Vec<StageTiming>,
     /// Answered ticks and rate: live until this frame, recorded of the whole run.
     pub pace: ShownPace,
+    /// Rectangle in which the ego detects, if its descriptor is known.
+    pub area: Option<DetectionArea>,
+    /// Average precision at an IoU of 0.5 of the frames until this one: live of those shown, recorded of the whole run.
+    pub ap_50: Option<f64>,
     /// Durations of the stages of each process.
     pub processes: Vec<Process>,
     /// Messages of all processes so far, by topic and receiver.
@@ -66,6 +71,8 @@ pub struct Vehicle {
     pub pose: Option<Planar>,
     /// Confidence of that pose, 0..=1.
     pub confidence: Option<f32>,
+    /// Covariance of the position: xx, xy, yy, square metres, if the pose source gives one.
+    pub covariance_m2: Option<[f32; 3]>,
     /// Reason for a missing pose.
     pub no_pose: Option<NoPoseReason>,
     /// True pose.
@@ -102,6 +109,16 @@ pub struct ShownBox {
     pub source: Option<CavId>,
     /// Class of a true object.
     pub class: Option<String>,
+    /// Id of a true object.
+    pub id: Option<i64>,
+    /// Speed of a true object, metres per second, if recorded.
+    pub speed_mps: Option<f64>,
+    /// True for a true object that the ego is expected to find.
+    pub is_counted: bool,
+    /// Score of the detection that found a true object.
+    pub found_score: Option<f32>,
+    /// Whether a detection is a true positive; `None` if that is not known.
+    pub is_hit: Option<bool>,
 }
 
 /// Traffic from one vehicle to an ego for one frame.

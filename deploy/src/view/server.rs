@@ -8,6 +8,7 @@ use std::time::Duration;
 use bus::web::{Answer, Request, WebServer};
 use bytes::Bytes;
 use futures_util::{StreamExt, stream};
+use protocol::{CavId, ImageFormat};
 use serde_json::json;
 
 use super::{LiveRun, RecordedRun};
@@ -15,8 +16,9 @@ use super::{LiveRun, RecordedRun};
 const HTML: &str = include_str!("page/index.html");
 const STYLE: &str = include_str!("page/style.css");
 /// Scripts, in the order in which the page loads them.
-const SCRIPTS: [(&str, &str); 3] = [
+const SCRIPTS: [(&str, &str); 4] = [
     ("/view.js", include_str!("page/view.js")),
+    ("/panels.js", include_str!("page/panels.js")),
     ("/scene.js", include_str!("page/scene.js")),
     ("/moments.js", include_str!("page/moments.js")),
 ];
@@ -35,16 +37,20 @@ pub fn serve_live(address: SocketAddr, run: Arc<LiveRun>) -> io::Result<WebServe
     WebServer::start(address, move |request| match request.path.as_str() {
         "/run" => document(&json!({"mode": "live", "run": run.name()})),
         "/live" => {
-            Answer::Stream { content_type: BINARY, pieces: run.moments(number("frames", &request.query)).boxed() }
+            Answer::Stream { content_type: BINARY, pieces: run.moments(number_of("frames", &request.query)).boxed() }
         }
+        "/status" => document(&json!(run.status())),
         "/hold" => hold(&request.query),
-        _ => asset(request),
+        path => match camera(path) {
+            Some((cav, number)) => image(run.images().get(&cav, number)),
+            None => asset(request),
+        },
     })
 }
 
 /// An empty script with a delay, by which a page defers its load event.
 fn hold(query: &str) -> Answer {
-    let time = Duration::from_millis(number("ms", query).unwrap_or(0)).min(LONGEST_HOLD);
+    let time = Duration::from_millis(number_of("ms", query).unwrap_or(0)).min(LONGEST_HOLD);
     let wait = async move {
         tokio::time::sleep(time).await;
         Bytes::new()
@@ -60,7 +66,16 @@ pub fn serve_recorded(address: SocketAddr, run: Arc<RecordedRun>) -> io::Result<
     WebServer::start(address, move |request| {
         if request.path == "/run" {
             let timeline: Vec<_> = run.timeline().collect();
-            return document(&json!({"mode": "recorded", "run": run.name(), "timeline": timeline}));
+            return document(
+                &json!({"mode": "recorded", "run": run.name(), "timeline": timeline, "cameras": run.cameras()}),
+            );
+        }
+        if let Some((cav, number)) = camera(&request.path) {
+            let index = number_of("at", &request.query).and_then(|index| usize::try_from(index).ok());
+            return match run.image(index.unwrap_or(0), &cav, number) {
+                Ok(found) => image(found),
+                Err(error) => Answer::NotFound(error.to_string()),
+            };
         }
         let Some(index) = request.path.strip_prefix("/frame/") else { return asset(request) };
         match index.parse().map(|index| run.frame(index)) {
@@ -70,6 +85,20 @@ pub fn serve_recorded(address: SocketAddr, run: Arc<RecordedRun>) -> io::Result<
             Err(error) => Answer::NotFound(format!("{index:?} is no number: {error}")),
         }
     })
+}
+
+/// Vehicle and number of `/camera/<cav>/<number>`.
+fn camera(path: &str) -> Option<(CavId, u8)> {
+    let (cav, number) = path.strip_prefix("/camera/")?.split_once('/')?;
+    Some((CavId::new(cav).ok()?, number.parse().ok()?))
+}
+
+fn image(found: Option<(ImageFormat, Bytes)>) -> Answer {
+    match found {
+        Some((ImageFormat::Png, body)) => Answer::Page { content_type: "image/png", body },
+        Some((ImageFormat::Jpeg, body)) => Answer::Page { content_type: "image/jpeg", body },
+        None => Answer::NotFound("there is no image of this camera".into()),
+    }
 }
 
 fn asset(request: &Request) -> Answer {
@@ -88,6 +117,6 @@ fn document(value: &serde_json::Value) -> Answer {
 }
 
 /// Number that a query has for `name`.
-fn number(name: &str, query: &str) -> Option<u64> {
+fn number_of(name: &str, query: &str) -> Option<u64> {
     query.split('&').find_map(|pair| pair.strip_prefix(name)?.strip_prefix('='))?.parse().ok()
 }

@@ -123,7 +123,7 @@ impl Scorer {
         for tally in &mut self.tallies {
             let mut taken = vec![false; objects.len()];
             for ((_, score), overlaps) in order.iter().zip(&overlaps) {
-                let is_true = take_best(overlaps, &mut taken, tally.iou_threshold);
+                let is_true = take_best(overlaps, &mut taken, tally.iou_threshold).is_some();
                 tally.matched.push(Matched { score: *score, is_true });
             }
             tally.objects += objects.len();
@@ -154,8 +154,22 @@ fn overlaps(found: &Polygon, objects: &[Polygon]) -> Vec<f32> {
     objects.iter().map(|object| found.iou(object) as f32).collect()
 }
 
+/// For each detection of a frame the index of the object that it matches at an overlap, as [`Scorer`] counts them.
+#[must_use]
+pub fn matches(detections: &[Detection], objects: &[Box3d], iou_threshold: f64) -> Vec<Option<usize>> {
+    let objects: Vec<_> = objects.iter().map(footprint).collect();
+    let mut order: Vec<usize> = (0..detections.len()).collect();
+    order.sort_by(|&a, &b| detections[b].score.total_cmp(&detections[a].score));
+    let (mut taken, mut matched) = (vec![false; objects.len()], vec![None; detections.len()]);
+    for index in order {
+        let overlaps = overlaps(&footprint(&detections[index].box3d), &objects);
+        matched[index] = take_best(&overlaps, &mut taken, iou_threshold);
+    }
+    matched
+}
+
 /// Takes the free object with the highest overlap, the first of equals, if it reaches the threshold.
-fn take_best(overlaps: &[f32], taken: &mut [bool], threshold: f64) -> bool {
+fn take_best(overlaps: &[f32], taken: &mut [bool], threshold: f64) -> Option<usize> {
     let mut best = None;
     for (index, &overlap) in overlaps.iter().enumerate() {
         if !taken[index] && best.is_none_or(|(_, highest)| overlap > highest) {
@@ -165,9 +179,9 @@ fn take_best(overlaps: &[f32], taken: &mut [bool], threshold: f64) -> bool {
     match best {
         Some((index, overlap)) if overlap >= threshold as f32 => {
             taken[index] = true;
-            true
+            Some(index)
         }
-        _ => false,
+        _ => None,
     }
 }
 
@@ -183,6 +197,16 @@ mod tests {
 
     fn found(x: f64, score: f32) -> Detection {
         Detection { box3d: car(x), score, source: None }
+    }
+
+    #[test]
+    fn matches_are_those_that_are_counted() {
+        let detections = [found(0.3, 0.4), found(0.1, 0.9), found(30.0, 0.8), found(10.0, 0.2)];
+        let objects = [car(10.0), car(0.0)];
+        assert_eq!(matches(&detections, &objects, 0.5), [None, Some(1), None, Some(0)]);
+        let mut scorer = Scorer::new(&[0.5]);
+        scorer.add(&detections, &objects);
+        assert_eq!(scorer.tallies()[0].matched.iter().filter(|matched| matched.is_true).count(), 2);
     }
 
     #[test]

@@ -106,7 +106,7 @@ mod tests {
 
     #[test]
     fn no_principal_may_answer_queries_or_delete() {
-        let members = ["agent-1", "ego-1", "link-1", "replay", "scorer", "recorder", "viewer"];
+        let members = ["agent-1", "ego-1", "link-1", "replay", "scorer", "recorder", "viewer", "ros2"];
         let access_control =
             AccessControl { members: members.map(|name| name.parse().unwrap()).into(), runs: RunScope::Any };
         let rules = access_control.rules();

@@ -101,7 +101,9 @@ impl BusError {
         matches!(self, Self::Endpoint(_) | Self::Keys { .. } | Self::NoKeys(_) | Self::SharedMemory { .. })
     }
 
-    pub(super) fn zenoh(doing: impl Into<String>, cause: &zenoh::Error) -> Self {
+    /// An error of zenoh during an operation.
+    #[must_use]
+    pub fn zenoh(doing: impl Into<String>, cause: &zenoh::Error) -> Self {
         Self::Zenoh { doing: doing.into(), cause: cause.to_string() }
     }
 }

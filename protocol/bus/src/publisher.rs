@@ -62,6 +62,8 @@ impl PublisherOptions {
     pub const SENSOR: Self = Self::new(Priority::DataLow, false);
     /// Radar points to an agent: some kilobytes.
     pub const RADAR: Self = Self::new(Priority::InteractiveLow, false);
+    /// Camera images, which no computation waits for.
+    pub const CAMERA: Self = Self::new(Priority::Background, false);
 
     /// Previews for people, not used in any computation.
     pub const PREVIEW: Self = Self { is_for_onlookers: true, ..Self::new(Priority::Background, false) };

@@ -328,7 +328,7 @@ mod tests {
 
     #[test]
     fn every_rule_reads_back() {
-        let members = ["agent-1", "ego-1", "link-1", "replay", "scorer", "recorder", "viewer"];
+        let members = ["agent-1", "ego-1", "link-1", "replay", "scorer", "recorder", "viewer", "ros2"];
         let members = members.map(|name| name.parse().unwrap()).into();
         let guard = AccessControl { members, runs: protocol::RunScope::Any };
         let options = BusOptions::router(Endpoint::loopback(7447)).with_access_control(guard);

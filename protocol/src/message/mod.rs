@@ -5,6 +5,7 @@
 
 mod bev;
 mod boxes;
+mod camera;
 mod control;
 mod descriptor;
 mod detections;
@@ -28,6 +29,7 @@ use crate::WireError;
 
 pub use bev::{Bev, BevMetadata};
 pub use boxes::Boxes;
+pub use camera::{Camera, CameraMetadata, ImageFormat, Pinhole};
 pub use control::{Control, TopicCount};
 pub use descriptor::{Descriptor, ModelHash};
 pub use detections::{Detections, DetectionsReport, FusedNeighbour, NeighbourState, SkippedNeighbour};

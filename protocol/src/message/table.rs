@@ -5,8 +5,8 @@ use std::fmt;
 use serde::{Deserialize, Serialize};
 
 use super::{
-    Bev, Boxes, Control, Descriptor, Detections, EgoMotion, Gnss, Lidar, Pace, Payload, Points, PoseEstimate, Radar,
-    Stats, Truth,
+    Bev, Boxes, Camera, Control, Descriptor, Detections, EgoMotion, Gnss, Lidar, Pace, Payload, Points, PoseEstimate,
+    Radar, Stats, Truth,
 };
 use crate::WireError;
 
@@ -115,6 +115,8 @@ messages! {
     13 => Imu(EgoMotion) = "imu",
     /// Sweeps that an ego has time for, ego to agents.
     14 => Pace(Pace) = "pace",
+    /// Image of a camera, replay to viewers and recorders.
+    15 => Camera(Camera) = "camera",
 }
 
 #[cfg(test)]

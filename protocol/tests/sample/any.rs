@@ -232,10 +232,31 @@ fn any_stats() -> impl Strategy<Value = Stats> {
         .prop_map(|(process, ledger, stages, usage, traffic)| Stats { process, ledger, stages, usage, traffic })
 }
 
+fn any_camera() -> impl Strategy<Value = Camera> {
+    let pinhole = prop::array::uniform4(1.0..1e5f64).prop_map(|[fx_px, fy_px, cx_px, cy_px]| Pinhole {
+        fx_px,
+        fy_px,
+        cx_px,
+        cy_px,
+    });
+    let format = select(vec![ImageFormat::Png, ImageFormat::Jpeg]);
+    let metadata = (format, 1..9000u32, 1..9000u32, option::of(pinhole), option::of(any_pose())).prop_map(
+        |(format, width_px, height_px, pinhole, lidar_from_camera)| CameraMetadata {
+            format,
+            width_px,
+            height_px,
+            pinhole,
+            lidar_from_camera,
+        },
+    );
+    (metadata, vec(any::<u8>(), 1..500)).prop_map(|(metadata, image)| Camera { metadata, image })
+}
+
 pub(crate) fn any_message() -> impl Strategy<Value = Message> {
     prop_oneof![
         1 => any_points().prop_map(|points| Message::Lidar(Lidar { points })),
         1 => any_points().prop_map(|points| Message::Radar(Radar { points })),
+        1 => any_camera().prop_map(Message::Camera),
         1 => (any_pose(), 0.0..100.0f64, 0.0..3.0f64).prop_map(|(world_from_lidar, position_std_m, heading_std_rad)| {
             let source = if position_std_m > 50.0 { GnssSource::Gnss } else { GnssSource::Recorded };
             Message::Gnss(Gnss { world_from_lidar, position_std_m, heading_std_rad, source })

@@ -144,6 +144,17 @@ fn truth() -> Truth {
     Truth { tick: 9, agents: vec![agent("4279"), agent("-1")] }
 }
 
+pub(crate) fn camera() -> Camera {
+    let metadata = CameraMetadata {
+        format: ImageFormat::Png,
+        width_px: 480,
+        height_px: 300,
+        pinhole: Some(Pinhole { fx_px: 201.5, fy_px: 201.25, cx_px: 240.0, cy_px: 150.0 }),
+        lidar_from_camera: Some(pose_at([3.0, 0.0, -0.9])),
+    };
+    Camera { metadata, image: (0..200u8).collect() }
+}
+
 pub(crate) fn every_kind() -> Vec<Message> {
     let process = ProcessId::new("agent-4279").unwrap();
     let topic: Topic = "4279/lidar".parse().unwrap();
@@ -151,6 +162,7 @@ pub(crate) fn every_kind() -> Vec<Message> {
         Message::Lidar(Lidar { points: points() }),
         Message::Lidar(Lidar::default()),
         Message::Radar(Radar { points: points() }),
+        Message::Camera(camera()),
         Message::Pace(Pace { interval_nanos: 200_000_000, phase_nanos: 1_500_000_000 }),
         Message::Imu(EgoMotion { speed_mps: Some(8.25), yaw_rate_rad_s: None }),
         Message::Gnss(Gnss {

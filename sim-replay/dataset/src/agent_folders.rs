@@ -29,6 +29,8 @@ pub(super) struct ScenarioFolder {
     /// Suffixes of point files other than the plain one and the radar's.
     pub(super) variants: Vec<String>,
     pub(super) has_radar: bool,
+    /// Numbers of the cameras of any agent.
+    pub(super) cameras: Vec<u8>,
     /// Suffix of the sweeps.
     pub(super) suffix: &'static str,
     /// Agents that have sweeps and nothing else.
@@ -133,15 +135,22 @@ impl ScenarioFolder {
         }
         let variants: BTreeSet<String> = by_agent.values().flat_map(|agent| agent.variants.iter().cloned()).collect();
         let has_radar = by_agent.values().any(|agent| agent.has_radar);
+        let cameras: BTreeSet<u8> = by_agent.values().flat_map(|agent| agent.cameras.iter().copied()).collect();
+        let cameras = cameras.into_iter().collect();
         let variants = variants.into_iter().collect();
         let bare = by_agent.iter().filter(|(_, agent)| agent.is_without_yaml);
         let without_yaml = bare.map(|(id, _)| id.clone()).collect();
-        Ok(Self { dir: dir.to_owned(), agents, stems, missing, variants, has_radar, suffix, without_yaml })
+        Ok(Self { dir: dir.to_owned(), agents, stems, missing, variants, has_radar, cameras, suffix, without_yaml })
+    }
+
+    /// The folder of an agent.
+    pub(super) fn agent_dir(&self, agent: &CavId) -> PathBuf {
+        self.dir.join(agent.as_str())
     }
 
     /// The metadata file of a frame.
     pub(super) fn yaml(&self, agent: &CavId, stem: &str) -> PathBuf {
-        self.dir.join(agent.as_str()).join(format!("{stem}.yaml"))
+        self.agent_dir(agent).join(format!("{stem}.yaml"))
     }
 
     /// True if the sweeps are bare floats, as V2X-Real stores them.
@@ -152,7 +161,7 @@ impl ScenarioFolder {
     /// The plain sweep of a frame, or a variant of it.
     pub(super) fn pcd(&self, agent: &CavId, stem: &str, variant: Option<&str>) -> PathBuf {
         let suffix = variant.map(|variant| format!("_{variant}")).unwrap_or_default();
-        self.dir.join(agent.as_str()).join(format!("{stem}{suffix}{}", self.suffix))
+        self.agent_dir(agent).join(format!("{stem}{suffix}{}", self.suffix))
     }
 
     /// The reader of all agents' sweeps.

@@ -4,7 +4,7 @@
 
 use std::str::FromStr;
 
-use protocol::{CavId, EgoMotion, Handedness, PointCloud, Pose};
+use protocol::{Camera, CavId, EgoMotion, Handedness, PointCloud, Pose};
 use serde::{Deserialize, Serialize};
 
 use crate::Problem;
@@ -99,6 +99,8 @@ pub struct Frame {
     pub dropped_points: usize,
     /// The 4D radar's points in the LiDAR frame, if recorded; the fourth value as stored.
     pub radar: Option<PointCloud>,
+    /// Images of the cameras, by number. Empty unless [`crate::LoadOptions::cameras`] is on.
+    pub cameras: Vec<(u8, Camera)>,
     /// True pose of the LiDAR. `None` if the data set gives no pose.
     pub world_from_lidar: Option<Pose>,
     /// True pose of the vehicle's own origin (not the LiDAR's), if recorded.
@@ -136,6 +138,7 @@ impl Frame {
             points: PointCloud::default(),
             dropped_points: 0,
             radar: None,
+            cameras: Vec::new(),
             world_from_lidar: None,
             world_from_vehicle: None,
             gnss_world_from_vehicle: None,

@@ -4,6 +4,7 @@ use std::collections::BTreeSet;
 use std::path::Path;
 
 use super::ReadError;
+use super::camera_files;
 use super::files::{self, Listing};
 
 /// Text in the names of YAML files that are no frames (OpenCOOD, V2V4Real).
@@ -21,6 +22,8 @@ pub(super) struct AgentFolder {
     pub(super) is_without_yaml: bool,
     pub(super) variants: BTreeSet<String>,
     pub(super) has_radar: bool,
+    /// Numbers of the cameras that have images.
+    pub(super) cameras: BTreeSet<u8>,
 }
 
 /// True if a folder has a frame's YAML and its sweep of the given suffix.
@@ -72,7 +75,8 @@ impl AgentFolder {
         let are_numbers = !yamls.is_empty() && yamls.iter().all(|stem| is_number(stem));
         let ending = if is_without_yaml { suffix } else { ".yaml" };
         let mut strays: Vec<String> = strays.into_iter().map(|stem| format!("{stem}{ending}")).collect();
-        let mut agent = Self { is_without_yaml, ..Self::default() };
+        let cameras = camera_files::numbers(&listing.files);
+        let mut agent = Self { is_without_yaml, cameras, ..Self::default() };
         let mut without_yaml = BTreeSet::new();
         for name in files::stems(&listing.files, suffix) {
             match Sweep::of(name, &yamls) {

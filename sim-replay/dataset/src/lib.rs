@@ -18,6 +18,7 @@
 
 mod agent_folders;
 mod annotations;
+pub mod camera_files;
 pub mod carla_pose;
 pub mod class_set;
 mod classes;
@@ -61,7 +62,7 @@ mod yaml;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use protocol::{CavId, Handedness};
+use protocol::{Camera, CavId, Handedness};
 use serde::Serialize;
 
 pub use error::ReadError;
@@ -124,6 +125,8 @@ pub struct Scenario {
     pub lidar_variants: Vec<String>,
     /// True if there are 4D radar points.
     pub has_radar: bool,
+    /// Numbers of the cameras that have images.
+    pub cameras: Vec<u8>,
     /// Layout of this scenario's files.
     pub layout: Layout,
     /// Handedness of the axes of the recording.
@@ -141,11 +144,30 @@ pub struct LoadOptions {
     pub points: bool,
     /// True to read the radar's points.
     pub radar: bool,
+    /// True to read the images of the cameras.
+    pub cameras: bool,
 }
 
 impl Default for LoadOptions {
     fn default() -> Self {
-        Self { lidar_variant: None, points: true, radar: false }
+        Self { lidar_variant: None, points: true, radar: false, cameras: false }
+    }
+}
+
+/// Images of the cameras of a frame, by number.
+#[derive(Debug, Default)]
+struct CameraImages {
+    images: Vec<(u8, Camera)>,
+    problems: Vec<Problem>,
+}
+
+impl CameraImages {
+    /// Adds the image of a camera, or the reason why there is none.
+    fn add(&mut self, number: u8, image: Result<Camera, ReadError>) {
+        match image {
+            Ok(image) => self.images.push((number, image)),
+            Err(error) => self.problems.push(Problem::from(&error)),
+        }
     }
 }
 
@@ -161,6 +183,11 @@ trait FrameSource: std::fmt::Debug + Send + Sync {
     fn radar(&self, agent: &CavId, tick: &Tick) -> Result<PcdCloud, ReadError> {
         let path = self.points_path(agent, tick, None);
         Err(ReadError::malformed(&path, "there are no radar points beside it"))
+    }
+
+    /// Reads the images of some cameras, by number; those that are missing or unreadable are named.
+    fn cameras(&self, _agent: &CavId, _tick: &Tick, _numbers: &[u8]) -> CameraImages {
+        CameraImages::default()
     }
 
     /// The file with the pose and objects of this frame alone, in layouts that have one.
@@ -186,6 +213,11 @@ impl Scenario {
         }
         if options.radar && self.has_radar {
             frame.radar = Some(self.load_radar(agent_index, tick_index)?.points);
+        }
+        if options.cameras && !self.cameras.is_empty() {
+            let CameraImages { images, problems } = self.source.cameras(agent, tick, &self.cameras);
+            frame.cameras = images;
+            frame.problems.extend(problems);
         }
         Ok(frame)
     }
@@ -270,6 +302,7 @@ fn single_vehicle(name: String, layout: Layout, ticks: Vec<Tick>, source: Arc<dy
         roadside_units: Vec::new(),
         lidar_variants: Vec::new(),
         has_radar: false,
+        cameras: Vec::new(),
         layout,
         source_handedness: Handedness::Right,
         absences: Absences::default(),

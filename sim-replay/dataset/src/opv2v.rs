@@ -12,7 +12,7 @@ use super::annotations::Annotations;
 use super::points::Sweeps;
 use super::written_pose::WrittenPose;
 use super::yaml::{self, Field};
-use super::{FrameSource, ReadError, Tick, points};
+use super::{CameraImages, FrameSource, Problem, ReadError, Tick, camera_files, points};
 use crate::carla_pose::CarlaPose;
 use crate::frame::Frame;
 use crate::pcd::PcdCloud;
@@ -41,6 +41,25 @@ impl FrameSource for Opv2v {
 
     fn radar(&self, agent: &CavId, tick: &Tick) -> Result<PcdCloud, ReadError> {
         points::read_pcd(&self.folder.radar(agent, &tick.stem)).map(|cloud| self.right_handed(cloud))
+    }
+
+    fn cameras(&self, agent: &CavId, tick: &Tick, numbers: &[u8]) -> CameraImages {
+        if self.folder.without_yaml.contains(agent) {
+            return CameraImages::default();
+        }
+        let path = self.folder.yaml(agent, &tick.stem);
+        let node = match yaml::read(&path) {
+            Ok(node) => node,
+            Err(error) => return CameraImages { problems: vec![Problem::from(&error)], ..CameraImages::default() },
+        };
+        let (root, dir) = (Field::root(&path, &node), self.folder.agent_dir(agent));
+        let mut found = CameraImages::default();
+        for &number in numbers {
+            // An agent may have fewer cameras than others.
+            let Some(file) = camera_files::find(&dir, &tick.stem, number) else { continue };
+            found.add(number, camera_files::read(&file, number, &root, &|field| self.six_numbers(field)));
+        }
+        found
     }
 
     fn annotation_path(&self, agent: &CavId, tick: &Tick) -> Option<PathBuf> {

@@ -99,6 +99,7 @@ fn agent_folder_scenario(
         roadside_units: folder.agents.iter().filter(is_unit).cloned().collect(),
         lidar_variants: folder.variants.clone(),
         has_radar: folder.has_radar,
+        cameras: if layout == Layout::V2V4REAL { Vec::new() } else { folder.cameras.clone() },
         layout,
         source_handedness,
         source: if layout == Layout::V2V4REAL {

@@ -1,6 +1,6 @@
 //! Recordings of live runs ([`recording`]) as scenes: sensor data and ground truth as they were published.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -8,7 +8,7 @@ use protocol::{CavId, EgoMotion, Gnss, Handedness, Lidar, Limits, Payload, Radar
 
 use super::layouts::{LayoutRow, Reader};
 use super::presence::Absences;
-use super::{Dataset, FrameSource, Layout, MissingFrame, OpenOptions, ReadError, Scenario, Tick};
+use super::{CameraImages, Dataset, FrameSource, Layout, MissingFrame, OpenOptions, ReadError, Scenario, Tick};
 use crate::frame::{Frame, Object, ObjectClass};
 use crate::pcd::{IntensityKind, IntensityOrigin, PcdCloud};
 use recording::{Entry, Recording, RecordingError};
@@ -52,6 +52,7 @@ fn open(file: &Path) -> Result<Dataset, ReadError> {
         name,
         absences: Absences::new(&agents, &ticks, &missing),
         roadside_units: agents.iter().filter(|id| id.as_str().starts_with('-')).cloned().collect(),
+        cameras: source.cameras(),
         has_radar: source.sensors.keys().any(|(_, _, stream)| *stream == Stream::Radar),
         agents,
         ticks,
@@ -84,7 +85,7 @@ impl Recorded {
             match &entry.key.topic {
                 Topic::Stream {
                     cav,
-                    stream: stream @ (Stream::Lidar | Stream::Gnss | Stream::Imu | Stream::Radar),
+                    stream: stream @ (Stream::Lidar | Stream::Gnss | Stream::Imu | Stream::Radar | Stream::Camera(_)),
                 } => {
                     sensors.entry((capture_nanos, cav.clone(), *stream)).or_insert_with(|| entry.clone());
                 }
@@ -149,6 +150,15 @@ impl Recorded {
         (ticks, missing)
     }
 
+    /// Numbers of the cameras that have images.
+    fn cameras(&self) -> Vec<u8> {
+        let numbers = self.sensors.keys().filter_map(|(_, _, stream)| match stream {
+            Stream::Camera(number) => Some(*number),
+            _ => None,
+        });
+        numbers.collect::<BTreeSet<u8>>().into_iter().collect()
+    }
+
     fn sensor<M: Payload>(&self, agent: &CavId, tick: &Tick, stream: Stream) -> Result<M, ReadError> {
         let key = (tick.capture_nanos, agent.clone(), stream);
         let lacks = || ReadError::malformed(self.recording.path(), format!("no {agent}/{stream} at {}", tick.stem));
@@ -184,6 +194,17 @@ impl FrameSource for Recorded {
     fn radar(&self, agent: &CavId, tick: &Tick) -> Result<PcdCloud, ReadError> {
         let Radar { points } = self.sensor(agent, tick, Stream::Radar)?;
         Ok(PcdCloud { points, ..PcdCloud::default() })
+    }
+
+    fn cameras(&self, agent: &CavId, tick: &Tick, numbers: &[u8]) -> CameraImages {
+        let mut found = CameraImages::default();
+        for &number in numbers {
+            let stream = Stream::Camera(number);
+            if self.sensors.contains_key(&(tick.capture_nanos, agent.clone(), stream)) {
+                found.add(number, self.sensor(agent, tick, stream));
+            }
+        }
+        found
     }
 
     fn points_path(&self, _: &CavId, _: &Tick, _: Option<&str>) -> PathBuf {

@@ -5,11 +5,14 @@
 //! | topic | encoding | content |
 //! | --- | --- | --- |
 //! | `v2v/<run>/...`, the key | `v2vloc`, or `json` | the message as transmitted, byte for byte |
-//! | `/<cav>/points`, `/<cav>/pose`, `/<cav>/detections`, `/truth`, `/tf` | `cdr`, schemas `ros2msg` | the same for ROS 2 tools |
+//! | those of the crate [`ros2`], for example `/cav_1000/points` | `cdr`, schemas `ros2msg` | the same for ROS 2 tools |
 //!
 //! The first are for this program: a replay publishes exactly the recorded messages. The second are for Foxglove, Rerun
-//! and other readers of ROS 2 bags. Log times are the arrival at the recorder on the Unix clock; header stamps are
-//! capture times on the scene's clock.
+//! and other readers of MCAP. Log times are the arrival at the recorder on the Unix clock; header stamps are capture times
+//! on the scene's clock.
+//!
+//! rosbag2 refuses a file with a channel that has no schema, as the first kind has none: [`export_ros2`] writes a bag of
+//! the second kind only.
 //!
 //! The file grows by whole chunks of at most some MiB or a second, each with its own checksum. A file that ends within
 //! a chunk (power, disk, `kill -9`) is read up to its last whole chunk, a file with a changed bit is read without that
@@ -46,21 +49,21 @@
 mod chunk;
 mod damage;
 mod error;
+mod export;
 mod lengths;
 mod reader;
 mod records;
 mod recover;
-mod ros;
-mod ros_schema;
 mod sink;
 mod writer;
 
 pub use damage::Damage;
 pub use error::RecordingError;
+pub use export::{ExportReport, ExportTimes, export_ros2};
 pub use reader::{Entry, Recording};
 pub use recover::{RecoverReport, recover};
 pub use sink::Store;
-pub use writer::{RecordingOptions, RecordingWriter};
+pub use writer::{Contents, RecordingOptions, RecordingWriter};
 
 /// Encoding of the channels that hold messages as transmitted.
 pub(crate) const OWN_ENCODING: &str = "v2vloc";

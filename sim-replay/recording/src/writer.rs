@@ -7,10 +7,9 @@ use std::path::{Path, PathBuf};
 use mcap::records::MessageHeader;
 use mcap::write::NoSeek;
 use mcap::{Compression, McapError, McapResult, WriteOptions};
-use protocol::{Key, Limits, Topic, wire};
+use protocol::{CavId, Key, Limits, RunId, Topic, wire};
+use ros2::{Distribution, Mount, RosMessage, RosTopic, Translator};
 
-use super::ros::{self, RosMessage};
-use super::ros_schema::RosType;
 use super::sink::{Store, WholeChunks};
 use super::{OWN_ENCODING, RecordingError};
 
@@ -21,20 +20,26 @@ const CHUNK_BYTES: usize = 4 << 20;
 const ANY_SIZE: Limits =
     Limits { max_abs_value: f32::MAX, max_points: u64::MAX, max_body_bytes: u64::MAX, ..Limits::DEFAULT };
 
+/// Channels of a recording.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Contents {
+    /// The messages as transmitted, and their translations for ROS 2 tools.
+    #[default]
+    All,
+    /// The messages as transmitted.
+    Messages,
+    /// The translations: a bag of ROS 2.
+    Ros2,
+}
+
 /// Options of a recording.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct RecordingOptions {
     /// zstd level, 1 to 22; `None`: chunks are not compressed. Clouds and feature maps hardly shrink, and compression
     /// occupies a core.
     pub zstd_level: Option<u32>,
-    /// True to write the channels for ROS 2 tools too.
-    pub with_ros: bool,
-}
-
-impl Default for RecordingOptions {
-    fn default() -> Self {
-        Self { zstd_level: None, with_ros: true }
-    }
+    /// Channels of the file.
+    pub contents: Contents,
 }
 
 /// A recording that is being written.
@@ -50,6 +55,8 @@ pub struct RecordingWriter<S: Store> {
     /// Messages and bytes of the open chunk.
     open: (u64, usize),
     whole_messages: u64,
+    /// Translator of each run.
+    translators: BTreeMap<RunId, Translator>,
     /// Topics with messages that could not be converted to ROS 2.
     unconverted: BTreeSet<Topic>,
     /// Reason why nothing more is written.
@@ -74,7 +81,8 @@ impl<S: Store> RecordingWriter<S> {
     /// [`RecordingError::Io`] if the header cannot be written.
     pub fn over(store: S, path: &Path, options: RecordingOptions) -> Result<Self, RecordingError> {
         let format = WriteOptions::new()
-            .profile("ros2")
+            // The profile promises that every channel is one of ROS 2.
+            .profile(if options.contents == Contents::Ros2 { "ros2" } else { "" })
             .library(concat!("v2vloc ", env!("CARGO_PKG_VERSION")))
             .compression(options.zstd_level.map(|_| Compression::Zstd))
             .compression_level(options.zstd_level.unwrap_or_default())
@@ -91,6 +99,7 @@ impl<S: Store> RecordingWriter<S> {
             channels: BTreeMap::new(),
             open: (0, 0),
             whole_messages: 0,
+            translators: BTreeMap::new(),
             unconverted: BTreeSet::new(),
             ended: None,
         };
@@ -113,22 +122,44 @@ impl<S: Store> RecordingWriter<S> {
     #[expect(clippy::cast_possible_truncation, reason = "MCAP has 32 bits for the sequence number, which may wrap")]
     fn add(&mut self, key: &Key, arrived_nanos: u64, payload: &[u8]) -> McapResult<()> {
         let header = wire::decode_header([payload]).ok();
-        let head = MessageHeader {
-            channel_id: self.channel(&key.to_string(), encoding_of(&key.topic), None)?,
-            sequence: header.as_ref().map_or(0, |header| header.stamp.sequence as u32),
-            log_time: arrived_nanos,
-            publish_time: header.as_ref().map_or(arrived_nanos, |header| header.stamp.publish_nanos),
-        };
-        self.mcap.write_to_known_channel(&head, payload)?;
-        self.open = (self.open.0 + 1, self.open.1 + payload.len());
-        if self.options.with_ros {
-            for RosMessage { topic, ros_type, cdr } in self.translated(key, payload) {
-                let channel_id = self.channel(&topic, "cdr", Some(ros_type))?;
-                self.mcap.write_to_known_channel(&MessageHeader { channel_id, ..head }, &cdr)?;
-                self.open.1 += cdr.len();
-            }
+        let sequence = header.as_ref().map_or(0, |header| header.stamp.sequence as u32);
+        if self.options.contents != Contents::Ros2 {
+            let publish_time = header.as_ref().map_or(arrived_nanos, |header| header.stamp.publish_nanos);
+            let channel_id = self.own_channel(key)?;
+            let head = MessageHeader { channel_id, sequence, log_time: arrived_nanos, publish_time };
+            self.put(&head, payload)?;
         }
-        Ok(())
+        let translations = self.translated(key, payload);
+        let is_counted = self.options.contents == Contents::Ros2 && !translations.is_empty();
+        self.open.0 += u64::from(is_counted || self.options.contents != Contents::Ros2);
+        translations.iter().try_for_each(|message| self.add_ros(arrived_nanos, sequence, message))
+    }
+
+    fn add_ros(&mut self, nanos: u64, sequence: u32, message: &RosMessage) -> McapResult<()> {
+        let channel_id = self.ros_channel(&message.topic)?;
+        // Published at the time of its arrival: several senders share /tf, whose times have to be in order.
+        self.put(&MessageHeader { channel_id, sequence, log_time: nanos, publish_time: nanos }, &message.cdr)
+    }
+
+    fn put(&mut self, head: &MessageHeader, data: &[u8]) -> McapResult<()> {
+        self.open.1 += data.len();
+        self.mcap.write_to_known_channel(head, data)
+    }
+
+    /// Writes the fixed transforms of `vehicles` at `nanos`, for bags.
+    ///
+    /// # Errors
+    /// As [`Self::write`].
+    pub fn write_static_transforms(
+        &mut self,
+        nanos: u64,
+        vehicles: &BTreeSet<CavId>,
+        mount: &Mount,
+    ) -> Result<(), RecordingError> {
+        self.check_open()?;
+        let cdr = ros2::static_transforms(nanos, vehicles.iter(), mount);
+        let added = self.add_ros(nanos, 0, &RosMessage { topic: RosTopic::TfStatic, cdr });
+        self.checked(added)
     }
 
     /// Ends the open chunk: everything written so far survives a crash of this process.
@@ -143,7 +174,8 @@ impl<S: Store> RecordingWriter<S> {
         Ok(())
     }
 
-    /// Messages in whole chunks: those that can be read back. Their copies for ROS 2 are not counted again.
+    /// Messages in whole chunks: those that can be read back. Translations are not counted again; a bag counts messages
+    /// that have one.
     #[must_use]
     pub fn whole_messages(&self) -> u64 {
         self.whole_messages
@@ -161,31 +193,57 @@ impl<S: Store> RecordingWriter<S> {
         Ok(())
     }
 
-    /// The channel of a topic, declared on first use.
-    fn channel(&mut self, topic: &str, encoding: &str, ros: Option<RosType>) -> McapResult<u16> {
-        if let Some(id) = self.channels.get(topic) {
+    /// The channel of messages as transmitted, declared on first use.
+    fn own_channel(&mut self, key: &Key) -> McapResult<u16> {
+        let topic = key.to_string();
+        match self.channels.get(&topic) {
+            Some(id) => Ok(*id),
+            None => self.add_channel(topic, 0, encoding_of(&key.topic), &BTreeMap::new()),
+        }
+    }
+
+    /// The channel of a ROS 2 topic, declared on first use with what rosbag2 asks for: a schema and the quality of service.
+    fn ros_channel(&mut self, topic: &RosTopic) -> McapResult<u16> {
+        let name = topic.name(None).to_string();
+        if let Some(id) = self.channels.get(&name) {
             return Ok(*id);
         }
-        let schema_id = match ros {
-            Some(ros) => self.mcap.add_schema(ros.name(), "ros2msg", ros.definition().as_bytes())?,
-            None => 0,
-        };
-        let id = self.mcap.add_channel(schema_id, topic, encoding, &BTreeMap::new())?;
-        self.channels.insert(topic.to_owned(), id);
+        let ros_type = topic.ros_type();
+        let schema_id = self.mcap.add_schema(&ros_type.name(), "ros2msg", ros_type.schema().as_bytes())?;
+        let metadata = [
+            ("offered_qos_profiles".to_owned(), topic.qos().offered_profiles()),
+            ("topic_type_hash".to_owned(), ros_type.hash(Distribution::Jazzy)),
+        ];
+        self.add_channel(name, schema_id, "cdr", &metadata.into())
+    }
+
+    fn add_channel(
+        &mut self,
+        topic: String,
+        schema_id: u16,
+        encoding: &str,
+        metadata: &BTreeMap<String, String>,
+    ) -> McapResult<u16> {
+        let id = self.mcap.add_channel(schema_id, &topic, encoding, metadata)?;
+        self.channels.insert(topic, id);
         Ok(id)
     }
 
     /// The ROS 2 messages of a message; none if ROS has no type for it. An invalid message is reported, once for its
     /// topic.
     fn translated(&mut self, key: &Key, payload: &[u8]) -> Vec<RosMessage> {
-        if !ros::has_type_for(&key.topic) {
+        if self.options.contents == Contents::Messages || !Translator::wants(&key.topic) {
             return Vec::new();
         }
         match wire::decode_any([payload], &ANY_SIZE) {
-            Ok((header, message)) => ros::translate(&key.topic, header.stamp.capture_nanos, &message),
+            Ok((header, message)) => {
+                let translator = self.translators.entry(key.run.clone());
+                let translator = translator.or_insert_with(|| Translator::new(&key.run));
+                translator.translate(&key.topic, header.stamp.capture_nanos, &message)
+            }
             Err(error) => {
                 if self.unconverted.insert(key.topic.clone()) {
-                    tracing::warn!("{key}: recorded as it came, but not for ROS 2 tools: {error}");
+                    tracing::warn!("{key}: not translated for ROS 2 tools: {error}");
                 }
                 Vec::new()
             }

@@ -1,6 +1,7 @@
 //! One file per sub-command: its arguments and its `run`.
 
 pub(crate) mod convert;
+pub(crate) mod export;
 pub(crate) mod inspect;
 pub(crate) mod link;
 pub(crate) mod record;

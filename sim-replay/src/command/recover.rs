@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use bus::log_to_stderr;
-use recording::{RecordingOptions, recover};
+use recording::{Contents, RecordingOptions, recover};
 use support::output;
 
 use support::cli::Outcome;
@@ -29,7 +29,8 @@ pub(crate) struct Args {
 /// Copies and reports the losses.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     log_to_stderr();
-    let options = RecordingOptions { with_ros: !args.plain, ..RecordingOptions::default() };
+    let contents = if args.plain { Contents::Messages } else { Contents::All };
+    let options = RecordingOptions { contents, ..RecordingOptions::default() };
     let report = match recover(&args.from, &args.out, options) {
         Ok(report) => report,
         Err(error) => {

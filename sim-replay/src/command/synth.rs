@@ -6,7 +6,7 @@ use std::ops::RangeInclusive;
 use std::path::PathBuf;
 use std::time::Instant;
 
-use simulator::generate::{self, SceneLayout, Subset, Summary, SynthError, SynthOptions, Weather};
+use simulator::generate::{self, ImageSize, SceneLayout, Subset, Summary, SynthError, SynthOptions, Weather};
 use simulator::map::RoadMapSource;
 use support::output;
 use support::progress;
@@ -56,6 +56,9 @@ pub(crate) struct Args {
     /// the plain sweep.
     #[arg(long, value_enum, value_delimiter = ',', value_name = "WEATHER")]
     copies: Vec<Weather>,
+    /// Render the images of four cameras per vehicle (ahead, right, left, back; 100 degrees wide), for example 480x300.
+    #[arg(long, value_name = "WIDTHxHEIGHT")]
+    cameras: Option<ImageSize>,
     /// Frames of each scenario [default: 60 for v2vdet, 2000 for the others].
     #[arg(long)]
     frames: Option<usize>,
@@ -106,6 +109,7 @@ fn options(args: Args) -> SynthOptions {
         agents: args.agents,
         weather: args.weather,
         copies: args.copies,
+        cameras: args.cameras,
         frames: args.frames.unwrap_or_else(|| SynthOptions::default_frames(args.subset)),
         period_s: args.period,
         force: args.force,

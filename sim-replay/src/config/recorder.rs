@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::recorder::RecorderOptions;
 use bus::{BusConfig, ProcessConfig};
-use recording::RecordingOptions;
+use recording::{Contents, RecordingOptions};
 
 /// Configuration of `sim-replay record`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema, clap::Args)]
@@ -75,9 +75,10 @@ impl RecorderConfig {
     #[must_use]
     pub fn options(&self) -> RecorderOptions {
         let RecordingConfig { without, plain, zstd_level } = self.record.clone();
+        let contents = if plain { Contents::Messages } else { Contents::All };
         RecorderOptions {
             out: self.out.clone(),
-            recording: RecordingOptions { zstd_level, with_ros: !plain },
+            recording: RecordingOptions { zstd_level, contents },
             without,
             keeps_running: self.keep_running || self.bus.supervised,
         }

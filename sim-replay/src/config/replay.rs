@@ -149,7 +149,12 @@ impl ReplayConfig {
             repeats: scene.repeat,
             seek: scene.seek,
             frames: scene.frames,
-            load: LoadOptions { lidar_variant: scene.variant.clone(), points: true, radar: scene.radar },
+            load: LoadOptions {
+                lidar_variant: scene.variant.clone(),
+                points: true,
+                radar: scene.radar,
+                cameras: scene.cameras,
+            },
             await_agents: wait.await_agents,
             expect: wait.expect.clone(),
             ready_timeout: seconds(wait.ready_timeout_s),

@@ -37,6 +37,10 @@ pub struct SceneConfig {
     #[arg(long)]
     #[serde(default)]
     pub radar: bool,
+    /// Publish camera images too.
+    #[arg(long)]
+    #[serde(default)]
+    pub cameras: bool,
     /// Seconds of the scene per second; 0: as fast as the subscribers accept it, without drops.
     #[arg(long, value_name = "TIMES")]
     #[serde(default = "SceneConfig::recorded_rate")]

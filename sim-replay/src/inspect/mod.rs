@@ -59,6 +59,8 @@ pub struct ScenarioReport {
     pub lidar_variants: Vec<String>,
     /// True if there are radar points.
     pub has_radar: bool,
+    /// Numbers of the cameras that have images.
+    pub cameras: Vec<u8>,
     /// Frames that some agents have and others lack.
     pub missing: Vec<MissingFrame>,
 }

@@ -149,7 +149,7 @@ fn survey_tick(scenario: &Scenario, tick: usize, rule: &GroundTruthRule) -> Tick
 
 fn survey_frame(scenario: &Scenario, agent: usize, tick: usize) -> (FrameFindings, Option<Frame>) {
     let mut findings = FrameFindings::default();
-    let without_points = dataset::LoadOptions { points: false, ..Default::default() };
+    let without_points = dataset::LoadOptions { points: false, cameras: true, ..Default::default() };
     let frame = scenario.load(agent, tick, &without_points);
     let frame = frame.map_err(|error| findings.problems.push(Problem::from(&error))).ok();
     let plain = survey_points(scenario, agent, tick, None, &mut findings);
@@ -280,6 +280,7 @@ fn summarize(scenario: &Scenario, findings: &[TickFindings]) -> ScenarioReport {
             .collect(),
         lidar_variants: scenario.lidar_variants.clone(),
         has_radar: scenario.has_radar,
+        cameras: scenario.cameras.clone(),
         missing: scenario.missing.clone(),
     }
 }

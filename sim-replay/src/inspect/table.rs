@@ -63,6 +63,10 @@ impl Report {
         if !scenario.lidar_variants.is_empty() {
             writeln!(f, "  LiDAR variants: {}", scenario.lidar_variants.join(", "))?;
         }
+        if !scenario.cameras.is_empty() {
+            let numbers: Vec<String> = scenario.cameras.iter().map(u8::to_string).collect();
+            writeln!(f, "  cameras: {}", numbers.join(", "))?;
+        }
         write_missing(f, scenario)?;
         self.write_merged(f, scenario)
     }

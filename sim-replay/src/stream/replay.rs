@@ -203,7 +203,7 @@ impl<'a> Replay<'a> {
             schedule,
             present: BTreeSet::new(),
             clock,
-            outlet: SensorPublisher::open(bus, &options.agents, options.load.radar, options.is_paced())?,
+            outlet: SensorPublisher::open(bus, &options.agents, &options.load, &scenario.cameras, options.is_paced())?,
             _subscriptions: subscriptions.collect::<Result<_, _>>()?,
             sensor_link,
             inbox,

@@ -61,9 +61,10 @@ impl SensorLink {
 
     /// Submits the current frame of vehicle `cav`. Data of all its sensors at a tick are transmitted together.
     pub(super) fn submit(&mut self, cav: &CavId, held: DelayedSweep, now: Instant) {
-        let Frame { points, radar, .. } = &held.frame;
+        let Frame { points, radar, cameras, .. } = &held.frame;
         let points = points.len() + radar.as_ref().map_or(0, |radar| radar.len());
-        let bytes = HEADER_LEN as u64 + POINT_BYTES * points as u64;
+        let images: usize = cameras.iter().map(|(_, camera)| camera.image.len()).sum();
+        let bytes = HEADER_LEN as u64 + POINT_BYTES * points as u64 + images as u64;
         let (id, submitted_nanos) = (self.next_id, nanos::between(self.began, now));
         self.next_id += 1;
         let next_sequence = self.next_sequences.entry(cav.clone()).or_default();

@@ -1,9 +1,10 @@
 //! Publishers of a replayed scene: each vehicle's sensors, and the ground truth.
 
 use protocol::message::{AgentTruth, TrueObject};
-use protocol::{CavId, Gnss, GnssSource, Lidar, Radar, Stream, Topic, TopicCount, Truth};
+use protocol::{Camera, CavId, Gnss, GnssSource, Lidar, Radar, Stream, Topic, TopicCount, Truth};
 
 use bus::{Bus, BusError, Publisher, PublisherOptions};
+use dataset::LoadOptions;
 use dataset::frame::{Frame, Object};
 use dataset::ground_truth::annotations;
 
@@ -18,6 +19,8 @@ struct Sensors {
     gnss: Publisher,
     imu: Publisher,
     radar: Option<Publisher>,
+    /// By number.
+    cameras: Vec<(u8, Publisher)>,
     preview: Publisher,
 }
 
@@ -29,8 +32,14 @@ pub(super) struct SensorPublisher {
 }
 
 impl SensorPublisher {
-    /// Publishers for `agents`. With `is_paced` the sender waits instead of replacing a sweep.
-    pub(super) fn open(bus: &Bus, agents: &[CavId], with_radar: bool, is_paced: bool) -> Result<Self, BusError> {
+    /// Publishers for `agents` and what is loaded of them, `cameras` among it. With `is_paced` the sender waits instead of replacing a sweep.
+    pub(super) fn open(
+        bus: &Bus,
+        agents: &[CavId],
+        load: &LoadOptions,
+        cameras: &[u8],
+        is_paced: bool,
+    ) -> Result<Self, BusError> {
         let paced = |options: PublisherOptions| if is_paced { options.lossless(LOSSLESS_PLACES) } else { options };
         let sensors = agents.iter().map(|cav| {
             let publisher = |stream, options| bus.publisher(Topic::Stream { cav: cav.clone(), stream }, paced(options));
@@ -39,7 +48,12 @@ impl SensorPublisher {
                 lidar: publisher(Stream::Lidar, PublisherOptions::SENSOR)?,
                 gnss: publisher(Stream::Gnss, PublisherOptions::POSE)?,
                 imu: publisher(Stream::Imu, PublisherOptions::POSE)?,
-                radar: with_radar.then(|| publisher(Stream::Radar, PublisherOptions::RADAR)).transpose()?,
+                radar: load.radar.then(|| publisher(Stream::Radar, PublisherOptions::RADAR)).transpose()?,
+                cameras: cameras
+                    .iter()
+                    .filter(|_| load.cameras)
+                    .map(|&number| Ok((number, publisher(Stream::Camera(number), PublisherOptions::CAMERA)?)))
+                    .collect::<Result<_, BusError>>()?,
                 preview: bus.publisher(
                     Topic::Stream { cav: cav.clone(), stream: Stream::Preview },
                     PublisherOptions::PREVIEW,
@@ -72,6 +86,18 @@ impl SensorPublisher {
             publisher.submit(capture_nanos, Radar { points });
             count(&mut self.sent, publisher.topic());
         }
+        self.submit_images(agent, capture_nanos, frame.cameras);
+    }
+
+    /// Submits the images of one vehicle.
+    fn submit_images(&mut self, agent: usize, capture_nanos: u64, images: Vec<(u8, Camera)>) {
+        let Some(sensors) = self.sensors.get(agent) else { return };
+        for (number, image) in images {
+            if let Some((_, publisher)) = sensors.cameras.iter().find(|(known, _)| *known == number) {
+                publisher.submit(capture_nanos, image);
+                count(&mut self.sent, publisher.topic());
+            }
+        }
     }
 
     /// Submits the ground truth of one tick.
@@ -82,10 +108,11 @@ impl SensorPublisher {
 
     /// Sends queued messages and ends every topic; returns the number of submitted messages by topic.
     pub(super) fn finish(self) -> Vec<TopicCount> {
-        for Sensors { lidar, gnss, imu, radar, preview } in self.sensors {
+        for Sensors { lidar, gnss, imu, radar, cameras, preview } in self.sensors {
             [Some(lidar), Some(gnss), Some(imu), radar, Some(preview)]
                 .into_iter()
                 .flatten()
+                .chain(cameras.into_iter().map(|(_, camera)| camera))
                 .for_each(Publisher::finish);
         }
         self.truth.finish();

@@ -13,6 +13,7 @@ use localization::pose_source::{ErrorTable, PoseTable};
 use perception::weights::Weights;
 use protocol::{Limits, wire};
 use recording::Recording;
+use ros2::{SweepLimits, read_point_cloud};
 use safetensors::tensor::{Dtype, TensorView, serialize};
 use sim_replay::stream::{Place, Schedule};
 use simulator::map;
@@ -61,6 +62,9 @@ pub fn all(root: &Path) -> Vec<Reader> {
     fs::write(file("experiment", "links/newest-first.yaml"), seeds::LINK).expect("a writable folder");
     let mut all = vec![
         in_memory("pcd", seeds::clouds(), |_, bytes| pcd::decode(bytes).is_ok()),
+        in_memory("ros2 cloud", vec![seeds::ros2_cloud()], |_, bytes| {
+            read_point_cloud(bytes, SweepLimits { max_points: 1 << 20, max_abs_value: 1e6 }).is_ok()
+        }),
         in_memory("opendrive", text(seeds::OPENDRIVE), |_, bytes| map::opendrive::read_bytes(bytes).is_ok()),
         on_disk("mcap recording", vec![seeds::recording(root)], file("mcap", "a.mcap"), read_recording),
         on_disk("scenario", text(seeds::SCENARIO), file("scenario", "a.yaml"), |path, _| {

@@ -3,8 +3,9 @@
 use std::path::Path;
 
 use dataset::pcd::{Encoding, IntensityField, encode};
-use protocol::{Key, RunId, wire};
+use protocol::{CavId, Key, Lidar, Message, RunId, Stream, Topic, wire};
 use recording::{RecordingOptions, RecordingWriter};
+use ros2::Translator;
 
 #[path = "../../../protocol/tests/sample/mod.rs"]
 mod sample;
@@ -65,6 +66,18 @@ fn compressed() -> Vec<u8> {
     file.extend((body.len() as u32).to_le_bytes());
     file.extend(packed);
     file
+}
+
+/// A sweep as `sensor_msgs/PointCloud2`.
+///
+/// # Panics
+/// Never: the sample is valid.
+#[must_use]
+pub fn ros2_cloud() -> Vec<u8> {
+    let topic = Topic::Stream { cav: CavId::new("4279").expect("an identifier"), stream: Stream::Lidar };
+    let message = Message::Lidar(Lidar { points: sample::points() });
+    let mut translator = Translator::new(&RunId::new("test").expect("an identifier"));
+    translator.translate(&topic, 1_500_000_000, &message).remove(0).cdr
 }
 
 /// A recording of a message of every kind.

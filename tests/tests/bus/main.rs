@@ -3,4 +3,5 @@
 mod flood;
 mod link;
 mod replay;
+mod ros2;
 mod sessions;

@@ -9,9 +9,10 @@ use dataset::frame::{Frame, Object};
 use dataset::pcd;
 use dataset::{self, LoadOptions};
 use nalgebra::Point3;
+use protocol::{CameraMetadata, ImageFormat};
 use simulator::generate::lidar::LIDAR_MOUNT_M;
 use simulator::generate::radar::red_to_velocity;
-use simulator::generate::{Subset, Summary, SynthError, SynthOptions, Weather, generate};
+use simulator::generate::{ImageSize, Subset, Summary, SynthError, SynthOptions, Weather, generate};
 use simulator::map::RoadMapSource;
 
 fn v2vdet(seed: u64, out: &Path) -> SynthOptions {
@@ -45,7 +46,7 @@ fn contents(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
 fn frames(folder: &Path) -> Vec<Vec<Frame>> {
     let dataset = dataset::open(folder).unwrap();
     assert!(dataset.problems.is_empty(), "{:?}", dataset.problems);
-    let options = LoadOptions { lidar_variant: None, points: true, radar: true };
+    let options = LoadOptions { lidar_variant: None, radar: true, ..LoadOptions::default() };
     let mut ticks = Vec::new();
     for scenario in &dataset.scenarios {
         for tick in 0..scenario.ticks.len() {
@@ -223,7 +224,7 @@ fn weather_copies_lie_beside_the_plain_sweep_and_change_nothing_else() {
     let scenario = &dataset.scenarios[0];
     assert_eq!(scenario.lidar_variants, ["fog_0.060", "snow_2.5_2.0"]);
     let points = |variant: Option<&str>| {
-        let options = LoadOptions { lidar_variant: variant.map(str::to_owned), points: true, radar: false };
+        let options = LoadOptions { lidar_variant: variant.map(str::to_owned), ..LoadOptions::default() };
         scenario.load(0, 0, &options).unwrap().points.len()
     };
     assert!(points(Some("fog_0.060")) < points(None) && points(Some("snow_2.5_2.0")) != points(None));
@@ -292,4 +293,37 @@ fn bad_options_are_named() {
     let map = Some(RoadMapSource::OpenDrive("no/such/map.xodr".into()));
     let missing = message(SynthOptions { map, ..v2vdet(1, folder.path()) });
     assert!(missing.contains("no/such/map.xodr"), "{missing}");
+}
+
+#[test]
+fn cameras_are_read_with_the_calibration_that_they_were_rendered_with() {
+    let dir = tempfile::tempdir().unwrap();
+    let size = ImageSize { width_px: 96, height_px: 60 };
+    let options = SynthOptions { cameras: Some(size), frames: 2, agents: 2..=2, ..v2vdet(12, dir.path()) };
+    made(&options);
+    let dataset = dataset::open(dir.path()).unwrap();
+    let scenario = &dataset.scenarios[0];
+    assert_eq!((&scenario.cameras[..], dataset.problems.len()), (&[0, 1, 2, 3][..], 0));
+    let load = LoadOptions { cameras: true, ..LoadOptions::default() };
+    let frame = scenario.load(1, 1, &load).unwrap();
+    assert!(frame.problems.is_empty(), "{:?}", frame.problems);
+    let mounts_m = [[3.0, 0.0, -0.95], [0.5, -0.3, -0.15], [0.5, 0.3, -0.15], [-1.5, 0.0, -0.45]];
+    for ((number, camera), mount_m) in frame.cameras.iter().zip(mounts_m) {
+        let CameraMetadata { format, width_px, height_px, pinhole, lidar_from_camera } = camera.metadata;
+        assert_eq!((format, width_px, height_px), (ImageFormat::Png, 96, 60));
+        let found = lidar_from_camera.unwrap();
+        let off_m = (0..3).map(|axis| (found.translation_m[axis] - mount_m[axis]).abs()).fold(0.0, f64::max);
+        assert!(off_m < 1e-3, "camera {number}: {found:?}");
+        // 50 degrees to the right of the optical axis is the right edge.
+        let [column, row] = pinhole.unwrap().project([50f64.to_radians().tan(), 0.0, 1.0]).unwrap();
+        assert!((column - 96.0).abs() < 1e-6 && (row - 30.0).abs() < 1e-6);
+    }
+    assert_eq!(frame.cameras.len(), 4);
+    // A broken image is left out and named; the rest of the frame is used.
+    let broken = dir.path().join(&scenario.name).join(scenario.agents[1].as_str());
+    std::fs::write(broken.join(format!("{}_camera2.png", scenario.ticks[1].stem)), b"no image").unwrap();
+    let frame = scenario.load(1, 1, &load).unwrap();
+    assert_eq!(frame.cameras.iter().map(|(number, _)| *number).collect::<Vec<_>>(), [0, 1, 3]);
+    assert!(frame.problems[0].message.contains("_camera2.png"), "{:?}", frame.problems);
+    assert!(scenario.load(1, 1, &LoadOptions::default()).unwrap().cameras.is_empty());
 }

@@ -151,7 +151,7 @@ fn competitors_are_evaluated_on_the_same_sweeps_with_the_same_numbers() {
     };
     // These sweeps are mostly ground, of which few cells are used; a regressed pose is always reported, with full
     // confidence.
-    let cells = localizer::write_end_to_end(folder.path(), EndToEndKind::SceneCoordinates, 3);
+    let cells = localizer::write_end_to_end(folder.path(), EndToEndKind::SgLoc, 3);
     let summary = json("--end-to-end", &cells);
     assert_eq!((&summary["sweeps"], &summary["outcomes"]["too_few_points"]), (&8.into(), &8.into()), "{summary}");
     assert!(summary["ms"]["solve"].as_f64().unwrap() > 0.0, "{summary}");

@@ -6,4 +6,5 @@ mod live_figures;
 mod localization;
 mod pace;
 mod processes;
+mod ros2_clients;
 mod simulation_time;

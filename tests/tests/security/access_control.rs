@@ -59,10 +59,11 @@ fn reaches(sender: &Bus, topic_text: &str, receiver: &Arc<Inbox>) {
 #[test]
 fn a_fleet_with_keys_performs_all_its_operations() {
     let folder = tempfile::tempdir().unwrap();
-    let keys = keys_for(folder.path(), &["agent-1", "ego-1", "link-1", "replay", "scorer", "recorder", "viewer"]);
+    let keys =
+        keys_for(folder.path(), &["agent-1", "ego-1", "link-1", "replay", "scorer", "recorder", "viewer", "ros2"]);
     let router = GuardedRouter::open(&keys);
-    let [agent, ego, link, replay, scorer, recorder, viewer] =
-        ["agent-1", "ego-1", "link-1", "replay", "scorer", "recorder", "viewer"]
+    let [agent, ego, link, replay, scorer, recorder, viewer, ros2] =
+        ["agent-1", "ego-1", "link-1", "replay", "scorer", "recorder", "viewer", "ros2"]
             .map(|principal| router.join(principal));
     let subscribe = |bus: &Bus, text: &str| {
         let inbox = bus.inbox(64, 4);
@@ -70,9 +71,10 @@ fn a_fleet_with_keys_performs_all_its_operations() {
         (inbox, subscription)
     };
     // Each process receives its topics.
-    for (sender, text, receivers) in
-        [(&agent, "1/pose", [&ego, &link, &scorer, &viewer].as_slice()), (&link, "rx/1/2/pose", &[&ego, &viewer])]
-    {
+    for (sender, text, receivers) in [
+        (&agent, "1/pose", [&ego, &link, &scorer, &viewer, &ros2].as_slice()),
+        (&link, "rx/1/2/pose", &[&ego, &viewer]),
+    ] {
         for receiver in receivers {
             let (inbox, _subscription) = subscribe(receiver, text);
             reaches(sender, text, &inbox);
@@ -110,6 +112,16 @@ fn a_fleet_with_keys_performs_all_its_operations() {
     preview.finish();
     drop(viewing);
 
+    // A LiDAR of a ROS 2 network is that of an agent.
+    let (inbox, _subscription) = subscribe(&agent, "1/lidar");
+    let lidar = ros2.publisher(topic("1/lidar"), PublisherOptions::SENSOR).unwrap();
+    wait_for("a sweep", || {
+        lidar.submit(3, Lidar::default());
+        let taken = inbox.take(Some(Instant::now() + Duration::from_millis(10)));
+        matches!(taken, bus::bounded_queue::Pop::Item(_, Event::Message(_)))
+    });
+    lidar.finish();
+
     // Membership is visible to its subscribers.
     let seen = Arc::<Mutex<Vec<String>>>::default();
     let _watch = ego.watch(protocol::Role::Agent, {
@@ -122,11 +134,11 @@ fn a_fleet_with_keys_performs_all_its_operations() {
     wait_for("a farewell", || seen.lock().unwrap().iter().any(|text| text.starts_with("Left")));
 
     // And no process published anything that was refused.
-    for principal in ["agent-1", "ego-1", "link-1", "replay", "scorer", "recorder", "viewer"] {
+    for principal in ["agent-1", "ego-1", "link-1", "replay", "scorer", "recorder", "viewer", "ros2"] {
         let refused = ["put", "query", "declare", "interest"].map(|message| router.refused(principal, message));
         assert_eq!(refused, [0; 4], "{principal}");
     }
-    for bus in [agent, ego, link, replay, scorer, recorder, viewer] {
+    for bus in [agent, ego, link, replay, scorer, recorder, viewer, ros2] {
         // Bounded: a query that the router does not answer would take all of it.
         let began = Instant::now();
         bus.leave(TIMEOUT).unwrap();

@@ -49,6 +49,7 @@ fn encoder_config(scenes: &Path, out: &Path, steps: u64) -> EncoderTrainConfig {
 
 fn scene_config(scenes: &Path, encoder: &Path, out: &Path, steps: u64) -> SceneTrainConfig {
     SceneTrainConfig {
+        init: None,
         scenes: vec![scenes.to_owned()],
         validation: vec![scenes.to_owned()],
         validation_sweeps: 12,
@@ -142,7 +143,7 @@ fn competitors_learn_on_the_features_of_an_encoder_that_stays_as_it_is() {
     let scenes = drives(dir.path());
     let encoder = train_encoder(&encoder_config(&scenes, &dir.path().join("encoder"), 1), &mut |_| ()).unwrap();
     let encoder = encoder.trained.weights;
-    for (regresses, batch, steps) in [(EndToEndKind::SceneCoordinates, 2, 150), (EndToEndKind::Pose, 32, 300)] {
+    for (regresses, batch, steps) in [(EndToEndKind::SgLoc, 2, 150), (EndToEndKind::Pose, 32, 300)] {
         let config = |steps| EndToEndTrainConfig {
             scenes: vec![scenes.clone()],
             regresses,

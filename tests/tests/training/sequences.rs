@@ -41,6 +41,7 @@ fn train_on(sequences: &Path, out: &Path) -> PathBuf {
 /// Trains a head on sequences, on the features of an encoder.
 fn train_head_on(sequences: &Path, encoder: &Path, out: &Path) -> PathBuf {
     let head = SceneTrainConfig {
+        init: None,
         scenes: vec![sequences.to_owned()],
         validation: vec![sequences.to_owned()],
         validation_sweeps: 10,

@@ -1,30 +1,26 @@
-//! Competitors of the localizer, trained end to end on one scene, for the comparison in the paper. They are no
-//! re-implementations of those works; each keeps their idea and leaves out what they build around it.
+//! Networks trained end to end on one scene: an encoder and a regressor, for the comparison in the paper.
 //!
-//! `scene_coordinates` stands for SGLoc: coordinates of cells regressed without classification and without predicted
-//! error; the solver weighs all cells equally. It has our encoder in place of SGLoc's, and neither its tri-scale
-//! attention nor its inter-geometric-consistency term.
+//! [`EndToEndKind::SgLoc`] keeps of SGLoc the position of a cell as a feature, the attention between scales, the residual head
+//! with batch normalisation, the shift as output, the L1 loss and RANSAC. It has PGC's encoder, frozen, in place of one
+//! of its own of 55 million parameters, a head of 2.7 million in place of 57, and no inter-geometric-consistency term,
+//! which the public training does not call either.
 //!
-//! `pose` stands for absolute pose regression, HypLiLoc and DiffLoc: one network from a sweep to a pose. It has none of
-//! the additions of these works (HypLiLoc's second branch on the spherical projection and its hyperbolic fusion;
-//! DiffLoc's foundation-model features and its denoising over a window of sweeps), and it regresses heading only, since
-//! vehicles stand upright.
-//!
-//! Both have our encoder (`lean`), the localizer's sweeps and a comparable time of training, not the GPU hours of the
-//! papers: the comparison is one of ideas at equal cost. In that time a network that starts from random weights does
-//! not converge; with the localizer's own encoder, frozen, only the last layers are trained.
+//! [`EndToEndKind::Pose`] stands for absolute pose regression, from the features of a whole sweep. It has none of the
+//! additions of HypLiLoc (a second branch on the spherical projection, hyperbolic fusion) and DiffLoc (features of a
+//! foundation model, denoising over a window of sweeps), and it regresses heading only, since vehicles stand upright.
 
 use serde::{Deserialize, Serialize};
 use tch::nn;
 use tch::{Kind, TchError, Tensor};
 
+use super::sgloc_head::SgLocHead;
 use crate::pgc::dense::Dense;
 use crate::pgc::encoder_config::SceneEncoderConfig;
 use crate::pgc::error::LocalizerError;
 use crate::pgc::feature_norm::FeatureNorm;
 use crate::pgc::scene_encoder::SceneEncoder;
 
-/// Channels inside the regressors.
+/// Channels inside the regressor of poses.
 const WIDTH: i64 = 512;
 /// Unit of regressed coordinates, metres.
 const SCALE_M: f64 = 100.0;
@@ -33,8 +29,9 @@ const SCALE_M: f64 = 100.0;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum EndToEndKind {
-    /// World coordinates of cells; a solver finds the pose.
-    SceneCoordinates,
+    /// World coordinates of cells, after SGLoc; a solver finds the pose.
+    #[serde(rename = "sgloc")]
+    SgLoc,
     /// The pose itself.
     Pose,
 }
@@ -60,7 +57,14 @@ pub struct EndToEnd {
     config: EndToEndConfig,
     encoder: SceneEncoder,
     norm: FeatureNorm,
-    layers: [Dense; 3],
+    regressor: Regressor,
+}
+
+/// Layers behind the encoder.
+#[derive(Debug)]
+enum Regressor {
+    SgLoc(SgLocHead),
+    Pose([Dense; 3]),
 }
 
 impl EndToEnd {
@@ -70,14 +74,20 @@ impl EndToEnd {
     /// [`LocalizerError::Config`] names the field that is wrong.
     pub fn new(path: &nn::Path<'_>, config: &EndToEndConfig) -> Result<Self, LocalizerError> {
         let encoder = SceneEncoder::new(&(path / "encoder"), &config.encoder)?;
-        let (inputs, outputs) = match config.regresses {
-            EndToEndKind::SceneCoordinates => (config.encoder.cell_channels(), 3),
-            EndToEndKind::Pose => (config.encoder.sweep_channels(), 5),
+        let below = path / "regressor";
+        let (inputs, regressor) = match config.regresses {
+            EndToEndKind::SgLoc => {
+                (config.encoder.cell_channels(), Regressor::SgLoc(SgLocHead::new(&below, &config.encoder)))
+            }
+            EndToEndKind::Pose => {
+                let inputs = config.encoder.sweep_channels();
+                let layer = |number: usize, from, to, gain| Dense::new(&(&below / number), from, to, gain);
+                let layers = [layer(0, inputs, WIDTH, 1.0), layer(1, WIDTH, WIDTH, 1.0), layer(2, WIDTH, 5, 0.1)];
+                (inputs, Regressor::Pose(layers))
+            }
         };
-        let norm = FeatureNorm::new(&(path / "regressor" / "norm"), inputs);
-        let layer = |number: usize, from, to, gain| Dense::new(&(path / "regressor" / number), from, to, gain);
-        let layers = [layer(0, inputs, WIDTH, 1.0), layer(1, WIDTH, WIDTH, 1.0), layer(2, WIDTH, outputs, 0.1)];
-        Ok(Self { config: config.clone(), encoder, norm, layers })
+        let norm = FeatureNorm::new(&(&below / "norm"), inputs);
+        Ok(Self { config: config.clone(), encoder, norm, regressor })
     }
 
     /// Configuration that it was built from.
@@ -92,21 +102,30 @@ impl EndToEnd {
         &self.encoder
     }
 
-    /// `[cells, 3]` world coordinates relative to the origin, metres, of some cells' features.
+    /// `[N, 3]` world coordinates relative to the origin, metres, of some cells' features `[N, cell_channels]`, which
+    /// lie at `sensor_m` `[N, 3]` in the sensor frame; `train` as in batch normalisation.
     ///
     /// # Errors
-    /// Those of the tensor library.
-    pub fn coordinates(&self, cells: &Tensor) -> Result<Tensor, TchError> {
-        Ok(self.regress(cells)? * SCALE_M)
+    /// Those of the tensor library; [`TchError::Shape`] if the network regresses something else.
+    pub fn coordinates(&self, cells: &Tensor, sensor_m: &Tensor, train: bool) -> Result<Tensor, TchError> {
+        match &self.regressor {
+            Regressor::SgLoc(head) => head.forward(&self.norm.forward(cells)?, sensor_m, train),
+            Regressor::Pose(_) => Err(TchError::Shape("this network regresses poses, not coordinates".into())),
+        }
     }
 
     /// `[S, 3]` positions relative to the origin, metres, and `[S, 2]` cosine and sine of headings, of length 1, of the
     /// features `[S, sweep_channels]` of whole sweeps.
     ///
     /// # Errors
-    /// Those of the tensor library.
+    /// Those of the tensor library; [`TchError::Shape`] if the network regresses something else.
     pub fn poses(&self, sweeps: &Tensor) -> Result<(Tensor, Tensor), TchError> {
-        let output = self.regress(sweeps)?;
+        let Regressor::Pose([first, second, third]) = &self.regressor else {
+            return Err(TchError::Shape("this network regresses coordinates, not poses".into()));
+        };
+        // In single precision, whatever the encoder computes in: bfloat16 resolves a position 200 m away to half a metre.
+        let x = self.norm.forward(sweeps)?;
+        let output = third.forward(&second.forward(&first.forward(&x)?.f_relu()?)?.f_relu()?)?;
         let heading = output.f_narrow(1, 3, 2)?;
         let norm = heading.f_square()?.f_sum_dim_intlist(1_i64, true, Kind::Float)?.f_add_scalar(1e-12)?.f_sqrt()?;
         Ok((output.f_narrow(1, 0, 3)? * SCALE_M, heading / norm))
@@ -119,12 +138,5 @@ impl EndToEnd {
     /// Those of the tensor library.
     pub fn set_statistics(&mut self, features: &Tensor) -> Result<(), TchError> {
         self.norm.fit(features)
-    }
-
-    /// In single precision, whatever the encoder computes in: bfloat16 resolves a position 200 m away to half a metre.
-    fn regress(&self, x: &Tensor) -> Result<Tensor, TchError> {
-        let [first, second, third] = &self.layers;
-        let x = second.forward(&first.forward(&self.norm.forward(x)?)?.f_relu()?)?.f_relu()?;
-        third.forward(&x)
     }
 }

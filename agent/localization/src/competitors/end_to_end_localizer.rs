@@ -79,16 +79,19 @@ impl EndToEndLocalizer {
         let chosen = choose_evenly(sweep.cells(), CELLS);
         let rows: Vec<i64> = chosen.iter().map(|&cell| cell as i64).collect();
         let rows = Tensor::f_from_slice(&rows)?.f_to_device(self.device)?;
+        let sensor_m: Vec<[f32; 3]> = chosen.iter().map(|&cell| sweep.cells()[cell].centroid_m).collect();
+        let places = Tensor::f_from_slice(sensor_m.as_flattened())?.f_view([-1, 3])?.f_to_device(self.device)?;
         let world: Vec<f32> = no_grad(|| {
-            let coordinates = self.network.coordinates(&features.cells.f_index_select(0, &rows)?)?;
+            let cells = features.cells.f_index_select(0, &rows)?;
+            let coordinates = self.network.coordinates(&cells, &places, false)?;
             Vec::try_from(&coordinates.f_reshape([-1])?.f_to_device(Device::Cpu)?)
         })?;
         times.regress = start.elapsed();
         let start = Instant::now();
         let coordinates = SceneCoordinates {
-            sensor_m: chosen.iter().map(|&cell| sweep.cells()[cell].centroid_m).collect(),
+            epsilon_m: vec![0.0; sensor_m.len()],
+            sensor_m,
             world_m: world.as_chunks().0.to_vec(),
-            epsilon_m: vec![0.0; chosen.len()],
             origin_m: self.config().origin_m,
         };
         let solved = self.solver.solve(&coordinates);
@@ -125,7 +128,7 @@ impl Localize for EndToEndLocalizer {
         let features = self.network.encoder().encode(&batch, Kind::Float)?;
         times.encode = start.elapsed();
         match self.config().regresses {
-            EndToEndKind::SceneCoordinates => self.by_cells(&sweep, &features, times),
+            EndToEndKind::SgLoc => self.by_cells(&sweep, &features, times),
             EndToEndKind::Pose => self.directly(&features, times),
         }
     }
@@ -219,11 +222,10 @@ mod tests {
         for bias in [[3e38, 0.0, 0.0, 1.0, 0.0], [0.0; 5]] {
             assert_eq!(answering(EndToEndKind::Pose, &bias).localize(&sweep()).unwrap().estimate, failed);
         }
-        let reason =
-            |bias: &[f32]| match answering(EndToEndKind::SceneCoordinates, bias).localize(&sweep()).unwrap().estimate {
-                PoseEstimate::NoPose { reason, .. } => reason,
-                pose @ PoseEstimate::Pose { .. } => panic!("{pose:?}"),
-            };
+        let reason = |bias: &[f32]| match answering(EndToEndKind::SgLoc, bias).localize(&sweep()).unwrap().estimate {
+            PoseEstimate::NoPose { reason, .. } => reason,
+            pose @ PoseEstimate::Pose { .. } => panic!("{pose:?}"),
+        };
         assert_eq!(reason(&[3e38, 0.0, 0.0]), NoPoseReason::TooFewPoints);
         assert_eq!(reason(&[0.1, 0.2, 0.3]), NoPoseReason::TooFewInliers, "all cells at one position");
     }
@@ -232,9 +234,7 @@ mod tests {
     fn sweeps_that_show_too_little_have_no_pose() {
         let nan = PointCloud { xyzi: vec![[f32::NAN; 4]; 5000] };
         let few = PointCloud { xyzi: (0..10).map(|k| [3.0 * k as f32, 3.0, 0.5, 0.1]).collect() };
-        for (kind, bias) in
-            [(EndToEndKind::SceneCoordinates, &[0.0; 3][..]), (EndToEndKind::Pose, &[0.0, 0.0, 0.0, 1.0, 0.0])]
-        {
+        for (kind, bias) in [(EndToEndKind::SgLoc, &[0.0; 3][..]), (EndToEndKind::Pose, &[0.0, 0.0, 0.0, 1.0, 0.0])] {
             let mut localizer = answering(kind, bias);
             for cloud in [&PointCloud::default(), &nan, &few] {
                 let estimate = localizer.localize(cloud).unwrap().estimate;
@@ -246,7 +246,7 @@ mod tests {
     #[test]
     fn files_of_something_else_are_named() {
         let folder = tempfile::tempdir().unwrap();
-        let (pose, cells) = (config(EndToEndKind::Pose), config(EndToEndKind::SceneCoordinates));
+        let (pose, cells) = (config(EndToEndKind::Pose), config(EndToEndKind::SgLoc));
         let error_text = |path: &Path| EndToEndLocalizer::load(path, Device::Cpu).unwrap_err().to_string();
         let path = write(folder.path(), &pose, &cells, &[0.0; 3]);
         let message = error_text(&path);

@@ -1,7 +1,12 @@
-//! Competitors of PGC in the paper: networks trained end to end.
+//! Competitors of PGC in the paper, small, and the floor that a regression has to beat.
 
 mod end_to_end;
 mod end_to_end_localizer;
+mod lightloc;
+mod retrieval;
+mod sgloc_head;
 
 pub use end_to_end::{EndToEnd, EndToEndConfig, EndToEndKind};
 pub use end_to_end_localizer::EndToEndLocalizer;
+pub use lightloc::LightLoc;
+pub use retrieval::{Retrieval, SweepDatabase};

@@ -208,6 +208,19 @@ impl Localizer {
         Ok((coordinates, times))
     }
 
+    /// Features of a whole sweep, `[sweep_channels]`, to compare sweeps by; `None` for a sweep without cells.
+    ///
+    /// # Errors
+    /// [`LocalizerError::Tensor`] when the tensor library fails.
+    pub fn sweep_features(
+        &self,
+        cloud: &PointCloud,
+        times: &mut LocalizerTimes,
+    ) -> Result<Option<Vec<f32>>, LocalizerError> {
+        let Some(encoded) = self.encode(cloud, times)? else { return Ok(None) };
+        Ok(Some(Vec::try_from(&encoded.features.sweeps.f_reshape([-1])?.f_to_device(Device::Cpu)?)?))
+    }
+
     /// Cells and features; `None` for a sweep without cells.
     fn encode(&self, cloud: &PointCloud, times: &mut LocalizerTimes) -> Result<Option<EncodedSweep>, LocalizerError> {
         let start = Instant::now();

@@ -9,7 +9,8 @@ use serde::{Deserialize, Serialize};
 
 use super::motion_gate::{MotionGate, MotionGateConfig};
 use super::{PoseInput, PoseSource};
-use crate::competitors::EndToEndLocalizer;
+use crate::competitors::{EndToEndLocalizer, LightLoc};
+use crate::pgc::pose_solver::PoseSolver;
 use crate::pgc::{Localize, Localizer, LocalizerError};
 
 /// Networks of PGC.
@@ -22,6 +23,10 @@ pub struct PgcConfig {
     /// Weights of the scene-specific head (pose source pgc).
     #[arg(long, value_name = "FILE")]
     pub head: PathBuf,
+    /// Leave out what PGC adds to LightLoc: predicted error, refinement and confidence (pose source pgc).
+    #[arg(long)]
+    #[serde(default)]
+    pub lightloc: bool,
     /// Motion limits of the vehicle.
     #[arg(skip)]
     #[serde(default)]
@@ -56,7 +61,11 @@ impl LocalizedPose {
     /// [`LocalizerError`] names the file and what is wrong with it.
     pub fn pgc(config: &PgcConfig, inference: Inference) -> Result<Self, LocalizerError> {
         let localizer = Localizer::load(&config.encoder, &config.head, inference)?;
-        Ok(Self::new(Box::new(localizer), config.motion_gate.clone()))
+        let localizer: Box<dyn Localize> = match config.lightloc {
+            true => Box::new(LightLoc::new(localizer, PoseSolver::default())),
+            false => Box::new(localizer),
+        };
+        Ok(Self::new(localizer, config.motion_gate.clone()))
     }
 
     /// Reads a network that was trained end to end, which is computed in floating point.

@@ -91,6 +91,8 @@ impl Args for PoseSourceConfig {
         let noise = serde_json::json!({ "noise": NoisyPoseConfig::default() });
         let command = document(command, options_of::<NoisyPoseConfig>(), &noise);
         let command = PgcConfig::augment_args_for_update(command);
+        let networks = serde_json::json!({ "pgc": PgcConfig::default() });
+        let command = document(command, options_of::<PgcConfig>(), &networks);
         let command = TrackedPoseConfig::augment_args_for_update(command);
         let tracking = serde_json::json!({ "tracking": TrackedPoseConfig::default() });
         let command = document(command, options_of::<TrackedPoseConfig>(), &tracking);

@@ -8,13 +8,14 @@ use agent_offline::evaluation::{
     evaluate_source, reliability_charts, write_csv, write_error_table,
 };
 use agent_offline::icp_map::{IcpMapPose, read_map};
+use agent_offline::sweep_database::read_database;
 use anyhow::Context;
 use clap::ValueEnum;
 use dataset::LeftOut;
-use localization::competitors::EndToEndLocalizer;
+use localization::competitors::{EndToEndLocalizer, LightLoc, Retrieval};
 use localization::pgc::confidence::{CONFIDENCE_KEY, Confidence, ConfidenceModel, FitReport, check_good_loss};
 use localization::pgc::pose_solver::{PoseSolver, Solver};
-use localization::pgc::{Localize, Localizer, LocalizerError};
+use localization::pgc::{Localize, Localizer};
 use localization::pose_source::{PoseSource, TrackedPose, TrackedPoseConfig};
 use localization::registration::icp::IcpConfig;
 use localization::registration::ransac::RansacConfig;
@@ -53,13 +54,25 @@ pub(crate) struct Args {
     /// Weights of a network that `agent train end-to-end` wrote, instead of encoder and head.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["encoder", "head", "fit_confidence"])]
     end_to_end: Option<PathBuf>,
+    /// Leave out what PGC adds to LightLoc: predicted error, refinement and confidence.
+    #[arg(long, conflicts_with_all = ["end_to_end", "fit_confidence", "tracked"])]
+    lightloc: bool,
+    /// Answer with the pose of the sweep of these drives that the encoder's features find most alike, the floor of
+    /// every regression.
+    #[arg(
+        long,
+        value_name = "DIR",
+        num_args = 1..,
+        conflicts_with_all = ["end_to_end", "lightloc", "fit_confidence", "tracked", "solver"]
+    )]
+    retrieval: Vec<PathBuf>,
     /// Register every sweep against a point-cloud map of these drives through the same scene (ICP), starting at the
     /// pose of the GNSS receiver, instead of networks.
     #[arg(
         long,
         value_name = "DIR",
         num_args = 1..,
-        conflicts_with_all = ["encoder", "head", "end_to_end", "fit_confidence", "solver"]
+        conflicts_with_all = ["encoder", "head", "end_to_end", "lightloc", "retrieval", "fit_confidence", "solver"]
     )]
     icp_map: Vec<PathBuf>,
     /// Distance between two sweeps on that point-cloud map, metres.
@@ -174,7 +187,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
 impl Args {
     fn subject(&self, head: &Path) -> Result<Subject, BadInput> {
         if self.icp_map.is_empty() {
-            return Ok(Subject::Localizer(self.localizer(head, self.inference()?).map_err(BadInput::of)?));
+            return Ok(Subject::Localizer(self.localizer(head, self.inference()?)?));
         }
         if !self.map_spacing.is_finite() || self.map_spacing < 0.0 {
             return Err(BadInput::new(format!("--map-spacing is {}, must be 0 or more", self.map_spacing)));
@@ -195,21 +208,39 @@ impl Args {
         Ok(Subject::Source(Box::new(TrackedPose::load(&config, self.inference()?).map_err(BadInput::of)?)))
     }
 
-    fn localizer(&self, head: &Path, inference: Inference) -> Result<Box<dyn Localize>, LocalizerError> {
+    fn localizer(&self, head: &Path, inference: Inference) -> Result<Box<dyn Localize>, BadInput> {
         let solver = match self.solver {
             Search::Ransac => Solver::Ransac(RansacConfig { seed: self.seed, ..RansacConfig::default() }),
             Search::Sc2pcr => Solver::Sc2Pcr(Sc2PcrConfig::default()),
         };
+        let plain = PoseSolver { solver: solver.clone(), ..PoseSolver::default() };
         if let Some(weights) = &self.end_to_end {
-            let mut localizer = EndToEndLocalizer::load(weights, inference.device)?;
-            localizer.set_solver(PoseSolver { solver, ..PoseSolver::default() });
+            let mut localizer = EndToEndLocalizer::load(weights, inference.device).map_err(BadInput::of)?;
+            localizer.set_solver(plain);
             return Ok(Box::new(localizer));
         }
         let load = if self.fit_confidence { Localizer::load_without_confidence } else { Localizer::load };
-        let mut localizer = load(&self.encoder(head), head, inference)?;
+        let mut localizer = load(&self.encoder(head), head, inference).map_err(BadInput::of)?;
+        if self.lightloc {
+            return Ok(Box::new(LightLoc::new(localizer, plain)));
+        }
+        if !self.retrieval.is_empty() {
+            return self.retrieval(localizer);
+        }
         let confidence = localizer.solver().confidence.clone();
         localizer.set_solver(PoseSolver { solver, confidence });
         Ok(Box::new(localizer))
+    }
+
+    fn retrieval(&self, localizer: Localizer) -> Result<Box<dyn Localize>, BadInput> {
+        let bar = progress::bar(0, "sweeps described");
+        let mut on_sweep = |done, all| {
+            bar.set_length(all as u64);
+            bar.set_position(done as u64);
+        };
+        let database = read_database(&self.retrieval, &localizer, &mut on_sweep);
+        bar.finish_and_clear();
+        Ok(Box::new(Retrieval::new(localizer, database.map_err(BadInput::of)?)))
     }
 
     fn encoder(&self, head: &Path) -> PathBuf {

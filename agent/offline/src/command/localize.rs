@@ -4,7 +4,6 @@ use std::path::{Path, PathBuf};
 
 use dataset::{self, LeftOut, LoadOptions, Problem, Scenario};
 use indicatif::ProgressBar;
-use localization::pose_source::motion_gate::MotionGateConfig;
 use localization::pose_source::{LocalizedPose, PgcConfig, PoseInput, PoseRow, PoseSource, PoseTable};
 use perception::inference::Inference;
 use perception::int8::InferencePrecision;
@@ -80,8 +79,7 @@ impl Args {
         left_out: &mut LeftOut,
         bar: &ProgressBar,
     ) -> anyhow::Result<usize> {
-        let motion_gate = MotionGateConfig::default();
-        let config = PgcConfig { encoder: self.encoder.clone(), head: head.to_owned(), motion_gate };
+        let config = PgcConfig { encoder: self.encoder.clone(), head: head.to_owned(), ..PgcConfig::default() };
         let mut rows: Vec<PoseRow<'_>> = Vec::new();
         let inference = Inference { precision: self.precision, ..Inference::default() };
         for (agent, cav) in scenario.agents.iter().enumerate() {

@@ -22,6 +22,9 @@ pub enum LocalizerTrainError {
     /// Sweeps overlap in range, but none has a cell in common with another one.
     #[error("{0} pairs of sweeps side by side have no cell at the same spot: are the sweeps empty?")]
     NoMatches(usize),
+    /// A head to start from finds its way in none of the sweeps.
+    #[error("the head of {0:?} recognises none of the sweeps: are they of another scene?")]
+    OtherScene(String),
     /// The network cannot be built or run.
     #[error(transparent)]
     Localizer(#[from] LocalizerError),

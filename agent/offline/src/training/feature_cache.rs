@@ -43,7 +43,7 @@ pub(crate) struct FeatureCache {
     pub sweeps: Tensor,
     /// `[S]`: true poses.
     pub world_from_sensor: Vec<Isometry3<f64>>,
-    /// Centre of the sensor positions, metres in the world.
+    /// Origin of the targets, metres in the world: the centre of the sensor positions, if no other was set.
     pub origin_m: [f64; 3],
 }
 
@@ -101,6 +101,18 @@ impl FeatureCache {
     #[must_use]
     pub(crate) fn sweep_count(&self) -> usize {
         self.world_from_sensor.len()
+    }
+
+    /// Lets the regression targets be relative to another origin, metres in the world.
+    ///
+    /// # Errors
+    /// Those of the tensor library.
+    pub(crate) fn move_origin(&mut self, origin_m: [f64; 3]) -> Result<(), TchError> {
+        let moved: [f32; 3] = std::array::from_fn(|axis| (self.origin_m[axis] - origin_m[axis]) as f32);
+        let moved = Tensor::f_from_slice(&moved)?.f_to_device(self.targets_m.device())?;
+        self.targets_m = self.targets_m.f_add(&moved)?;
+        self.origin_m = origin_m;
+        Ok(())
     }
 
     /// Number of cells.

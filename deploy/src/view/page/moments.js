@@ -38,12 +38,32 @@ async function live() {
 }
 
 async function watch() {
+  setInterval(check, 1000);
   for (;;) {
     await live().catch(() => {});
-    state("ended", still ? "live, stopped" : "the run is gone; trying again");
+    state("ended", still ? "live, stopped" : "v2vloc view is gone; trying again");
     if (still) return;
     await new Promise((resolve) => setTimeout(resolve, 2000));
   }
+}
+
+let probes = 0;
+
+/// State of the live run: going on, over, or out of reach.
+async function check() {
+  const answer = await fetch("status").catch(() => null);
+  if (!answer || !answer.ok) return;
+  const { silent_s: silent, is_over: over, has_router: router, cameras } = await answer.json();
+  if (cameras.length) view.cameras = cameras;
+  // Images are received only while somebody asks for them: asked once in a while whether there are any.
+  else if (view.frame && view.frame.ego && probes++ % 30 === 0) fetch(`camera/${view.frame.ego}/0`).catch(() => {});
+  const before = isKnown(silent) ? ` ${seconds(silent)} ago` : "";
+  if (!router) state("ended", "router gone");
+  else if (over && silent > 2) state("ended", `ended${before}`);
+  else if (!isKnown(silent)) state("waiting", "waiting for the run");
+  else if (silent > 3) state("ended", `last message${before}`);
+  else state("live", "live");
+  if (!isKnown(silent)) hint("Nothing is published in this run yet.");
 }
 
 const tape = { timeline: [], at: -1, wanted: 0, busy: false, playing: null };
@@ -62,6 +82,8 @@ async function seek(index) {
       show(await answer.arrayBuffer());
       tape.at = next;
       $("moment").textContent = `${next + 1} of ${tape.timeline.length}`;
+      // A link to this moment.
+      history.replaceState(null, "", `#at=${next}`);
       spark();
     }
   } finally {
@@ -71,13 +93,22 @@ async function seek(index) {
 
 function play(on) {
   clearInterval(tape.playing);
+  const last = tape.timeline.length - 1;
+  // At the end it starts again.
+  if (on && tape.wanted >= last) seek(0);
   tape.playing = on ? setInterval(() => {
-    if (tape.wanted + 1 >= tape.timeline.length) play(false); else seek(tape.wanted + 1);
-  }, 100) : null;
+    if (tape.wanted >= last) play(false); else seek(tape.wanted + 1);
+  }, 100 / Number($("speed").value)) : null;
   $("play").textContent = on ? "pause" : "play";
 }
 
-/// Latency over the run; gaps are frames without detections.
+/// The frame with the most false positives and missed objects.
+function worst() {
+  const wrong = (moment) => (moment.judged ? moment.judged[1] + moment.judged[2] : -1);
+  return tape.timeline.reduce((most, moment, index) => (wrong(moment) > wrong(tape.timeline[most]) ? index : most), 0);
+}
+
+/// Latency over the run; marks below the line are ticks without a result.
 function spark() {
   const chart = $("spark");
   const [scale, width, height] = [devicePixelRatio || 1, chart.clientWidth, 44];
@@ -92,10 +123,11 @@ function spark() {
   const y = (time) => height - 4 - (height - 18) * time / most;
   pen.fillStyle = colour("--faint");
   pen.font = "11px system-ui, sans-serif";
-  pen.fillText(`latency, up to ${ms(most)}`, 8, 10);
+  const gaps = times.filter((time) => time === null).length;
+  pen.fillText(`latency, up to ${ms(most)}${gaps ? `; ${gaps} ticks without a result (marks at the bottom)` : ""}`, 8, 10);
   const bar = Math.max(1, Math.min(10, (width - 16) / times.length - 1));
   times.forEach((time, index) => {
-    pen.fillStyle = time === null ? colour("--bad") : colour("--accent");
+    pen.fillStyle = time === null ? colour("--wrong") : colour("--accent");
     pen.globalAlpha = index === tape.at ? 1 : 0.45;
     const top = time === null ? height - 7 : y(time);
     pen.fillRect(x(index) - bar / 2, top, bar, height - 4 - top);
@@ -103,25 +135,37 @@ function spark() {
   pen.globalAlpha = 1;
 }
 
+/// Moment that the address names (`#at=N`).
+function asked() {
+  const at = /at=(\d+)/.exec(location.hash || location.search);
+  return at ? Number(at[1]) : 0;
+}
+
 async function begin() {
   const run = await (await fetch("run")).json();
   $("run").textContent = run.run;
   document.title = `${run.run} · v2vloc`;
+  view.cameras = run.cameras || [];
   if (run.mode === "live") return watch();
   tape.timeline = run.timeline;
   $("timeline").hidden = false;
   $("seek").max = String(run.timeline.length - 1);
   $("seek").addEventListener("input", () => { play(false); seek(Number($("seek").value)); });
   $("play").addEventListener("click", () => play(!tape.playing));
+  $("speed").addEventListener("change", () => { if (tape.playing) play(true); });
+  $("back").addEventListener("click", () => { play(false); seek(tape.wanted - 1); });
+  $("ahead").addEventListener("click", () => { play(false); seek(tape.wanted + 1); });
+  $("worst").addEventListener("click", () => { play(false); seek(worst()); });
   addEventListener("keydown", (event) => {
-    if (event.target.tagName === "BUTTON" || event.target.tagName === "INPUT") return;
+    const isSlider = event.target.id === "seek";
+    if (["BUTTON", "SELECT", "INPUT", "SUMMARY"].includes(event.target.tagName) && !isSlider) return;
     if (event.key === " ") { event.preventDefault(); play(!tape.playing); }
-    if (event.key === "ArrowRight") seek(tape.wanted + 1);
-    if (event.key === "ArrowLeft") seek(tape.wanted - 1);
+    if (event.key === "ArrowRight") { event.preventDefault(); seek(tape.wanted + 1); }
+    if (event.key === "ArrowLeft") { event.preventDefault(); seek(tape.wanted - 1); }
   });
+  addEventListener("hashchange", () => seek(asked()));
   state("recorded", "recorded");
-  const asked = /at=(\d+)/.exec(location.search);
-  await seek(asked ? Number(asked[1]) : 0);
+  await seek(asked());
 }
 
 begin().catch((error) => { fail(String(error)); state("ended", "no answer from v2vloc view"); });

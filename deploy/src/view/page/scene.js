@@ -30,16 +30,41 @@ function draw() {
     if (vehicle.world_from_lidar && !view.hidden.has(`points ${vehicle.cav}`)) points(pen, vehicle, offset, place, width, height);
     offset += 3 * vehicle.points;
   }
-  if (!view.hidden.has("truth")) frame.truth.forEach((box) => outline(pen, box, place, colour("--truth"), 1.5, true));
-  if (!view.hidden.has("single")) frame.single.forEach((box) => outline(pen, box, place, ink(box.source), 1, false, [4, 3]));
-  for (const box of frame.detections) {
-    const source = box.source || "fused";
-    if (view.hidden.has(`detections ${source}`)) continue;
-    pen.globalAlpha = 0.45 + 0.55 * (box.score || 0);
-    outline(pen, box, place, box.source ? ink(box.source) : colour("--detection"), 2, false);
-    pen.globalAlpha = 1;
+  const { of, age } = results();
+  const result = of || frame;
+  // The result of an earlier tick is faded.
+  const fade = age > 0.001 ? 0.35 : 1;
+  const own = ego(result);
+  if (result.area && own && own.world_from_lidar && !view.hidden.has("area")) area(pen, result.area, own.world_from_lidar, place);
+  pen.globalAlpha = fade;
+  for (const box of frame.ego ? frame.truth : (result.truth.length ? result.truth : frame.truth)) {
+    const isMissed = box.is_counted && !(box.found_score >= view.score);
+    if (view.hidden.has(isMissed ? "missed" : "truth")) continue;
+    outline(pen, box, place, colour("--truth"), isMissed ? 2.5 : 1, !isMissed, isMissed ? [5, 3] : [], isChosen({ object: box.id }));
   }
+  if (!view.hidden.has("single")) result.single.forEach((box) => outline(pen, box, place, ink(box.source), 1, false, [1, 3]));
+  for (const box of result.detections) {
+    if (box.score < view.score || view.hidden.has(box.is_hit === false ? "wrong" : "hit")) continue;
+    pen.globalAlpha = fade * (0.5 + 0.5 * box.score);
+    outline(pen, box, place, colour(box.is_hit === false ? "--wrong" : "--hit"), 2, false, [], view.chosen && view.chosen.box === box);
+  }
+  pen.globalAlpha = 1;
   frame.vehicles.forEach((vehicle) => vehicleMark(pen, vehicle, place));
+}
+
+const isChosen = (what) => view.chosen && isKnown(what.object) && view.chosen.object === what.object;
+
+/// World position of a point of a vehicle's LiDAR frame.
+const placed = (m, x, y) => [m[0] * x + m[1] * y + m[3], m[4] * x + m[5] * y + m[7]];
+
+/// Rectangle in which the ego detects.
+function area(pen, { x_m: [x0, x1], y_m: [y0, y1] }, m, place) {
+  pen.beginPath();
+  [[x0, y0], [x1, y0], [x1, y1], [x0, y1]].forEach(([x, y], index) => pen[index ? "lineTo" : "moveTo"](...place(...placed(m, x, y))));
+  pen.closePath();
+  pen.strokeStyle = colour("--area");
+  pen.lineWidth = 1.5;
+  pen.stroke();
 }
 
 function rings(pen, middle, width, height) {
@@ -71,7 +96,7 @@ function points(pen, vehicle, offset, place, width, height) {
   pen.globalAlpha = 1;
 }
 
-function outline(pen, box, place, shade, line, filled, dash = []) {
+function outline(pen, box, place, shade, line, filled, dash = [], marked = false) {
   const [x, y] = box.center_m;
   const [cosine, sine] = [Math.cos(box.heading_rad), Math.sin(box.heading_rad)];
   const [length, width] = [box.size_m[0] / 2, box.size_m[1] / 2];
@@ -84,7 +109,7 @@ function outline(pen, box, place, shade, line, filled, dash = []) {
   pen.moveTo(...heart);
   pen.lineTo(...front);
   pen.strokeStyle = shade;
-  pen.lineWidth = line;
+  pen.lineWidth = marked ? line + 2.5 : line;
   pen.setLineDash(dash);
   pen.stroke();
   pen.setLineDash([]);
@@ -97,7 +122,7 @@ function outline(pen, box, place, shade, line, filled, dash = []) {
   }
 }
 
-/// Estimated pose of a vehicle, a ring for its confidence, and a line to the true pose.
+/// Estimated pose of a vehicle, the ellipse of its uncertainty, and a line to the true pose.
 function vehicleMark(pen, vehicle, place) {
   const at = vehicle.pose || vehicle.truth;
   if (!at) return;
@@ -106,7 +131,7 @@ function vehicleMark(pen, vehicle, place) {
   const [a, b] = place(at.x_m + 3 * Math.cos(at.yaw_rad), at.y_m + 3 * Math.sin(at.yaw_rad));
   pen.strokeStyle = shade;
   pen.fillStyle = vehicle.pose ? shade : colour("--sheet");
-  pen.lineWidth = 2;
+  pen.lineWidth = view.chosen && view.chosen.cav === vehicle.cav ? 4 : 2;
   pen.beginPath();
   pen.moveTo(u, v);
   pen.lineTo(a, b);
@@ -115,12 +140,7 @@ function vehicleMark(pen, vehicle, place) {
   pen.arc(u, v, 5, 0, 2 * Math.PI);
   pen.fill();
   pen.stroke();
-  if (vehicle.pose) {
-    pen.beginPath();
-    pen.arc(u, v, 11, -Math.PI / 2, -Math.PI / 2 + 2 * Math.PI * vehicle.confidence);
-    pen.lineWidth = 3;
-    pen.stroke();
-  }
+  if (vehicle.pose && !view.hidden.has("sigma")) ellipse(pen, vehicle, at, place, shade);
   if (vehicle.pose && vehicle.truth && vehicle.error_m > 0.5) {
     pen.lineWidth = 1;
     pen.setLineDash([3, 3]);
@@ -136,12 +156,70 @@ function vehicleMark(pen, vehicle, place) {
   pen.fillText(vehicle.cav, u + 15, v - 8);
 }
 
+/// 95 % of the position: 2.45 standard deviations along both axes of the covariance.
+function ellipse(pen, vehicle, at, place, shade) {
+  const round = sigma(vehicle);
+  if (!isKnown(round)) return;
+  const [xx, xy, yy] = vehicle.covariance_m2 || [round ** 2, 0, round ** 2];
+  const [middle, apart] = [(xx + yy) / 2, Math.hypot((xx - yy) / 2, xy)];
+  const [long, short, turn] = [Math.sqrt(middle + apart), Math.sqrt(Math.max(0, middle - apart)), Math.atan2(2 * xy, xx - yy) / 2];
+  pen.beginPath();
+  for (let step = 0; step <= 36; step += 1) {
+    const [c, s] = [2.45 * long * Math.cos(step * Math.PI / 18), 2.45 * short * Math.sin(step * Math.PI / 18)];
+    pen[step ? "lineTo" : "moveTo"](...place(at.x_m + c * Math.cos(turn) - s * Math.sin(turn), at.y_m + c * Math.sin(turn) + s * Math.cos(turn)));
+  }
+  pen.strokeStyle = shade;
+  pen.lineWidth = 1.5;
+  pen.stroke();
+}
+
+// ---- selection ----
+
+/// The box or vehicle at a position of the canvas.
+function at(u, v) {
+  const { frame } = view;
+  if (!frame) return null;
+  const world = unplace(u, v);
+  const near = frame.vehicles.find((vehicle) => {
+    const place = vehicle.pose || vehicle.truth;
+    return place && Math.hypot(place.x_m - world[0], place.y_m - world[1]) * view.zoom < 14;
+  });
+  if (near) return { cav: near.cav };
+  const inside = (box) => {
+    const [dx, dy] = [world[0] - box.center_m[0], world[1] - box.center_m[1]];
+    const [c, s] = [Math.cos(box.heading_rad), Math.sin(box.heading_rad)];
+    return Math.abs(c * dx + s * dy) < box.size_m[0] / 2 + 0.3 && Math.abs(c * dy - s * dx) < box.size_m[1] / 2 + 0.3;
+  };
+  const result = results().of || frame;
+  const box = result.detections.filter((found) => found.score >= view.score).find(inside);
+  if (box) return { box };
+  const object = result.truth.find(inside);
+  return object ? { object: object.id } : null;
+}
+
+/// World position of a position of the canvas: the inverse of `place` in `draw`.
+function unplace(u, v) {
+  const [cosine, sine] = [Math.cos(view.turn), Math.sin(view.turn)];
+  const [a, b] = [(canvas.clientWidth / 2 + view.shift[0] - u) / view.zoom, (canvas.clientHeight * 0.55 + view.shift[1] - v) / view.zoom];
+  // a = cosine * dy - sine * dx, b = cosine * dx + sine * dy
+  return [view.centre[0] + cosine * b - sine * a, view.centre[1] + cosine * a + sine * b];
+}
+
 // ---- navigation ----
+
+let pressed = null;
 
 const fingers = new Map();
 canvas.addEventListener("pointerdown", (event) => {
   canvas.setPointerCapture(event.pointerId);
   fingers.set(event.pointerId, [event.clientX, event.clientY]);
+  pressed = fingers.size === 1 ? [event.clientX, event.clientY] : null;
+});
+canvas.addEventListener("pointerup", (event) => {
+  const isClick = pressed && Math.hypot(event.clientX - pressed[0], event.clientY - pressed[1]) < 5;
+  if (!isClick) return;
+  const { left, top } = canvas.getBoundingClientRect();
+  choose(at(event.clientX - left, event.clientY - top));
 });
 canvas.addEventListener("pointermove", (event) => {
   const before = fingers.get(event.pointerId);

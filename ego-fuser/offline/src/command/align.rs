@@ -43,9 +43,9 @@ pub(crate) struct Arguments {
     /// One more method: the poses of a source, described as in a scenario file. May be repeated.
     #[arg(long, value_name = "NAME=FILE.yaml")]
     pose_source: Vec<NamedSource>,
-    /// Source of boxes.
-    #[arg(long, value_enum, default_value = "detected")]
-    boxes: Boxes,
+    /// Sources of boxes; with several, methods that match boxes have a row for each.
+    #[arg(long, value_enum, num_args = 1.., default_value = "detected")]
+    boxes: Vec<Boxes>,
     /// Weights of the detector, for detected boxes.
     #[arg(long, value_name = "FILE")]
     weights: Option<PathBuf>,
@@ -95,6 +95,15 @@ enum Boxes {
     Annotated,
 }
 
+impl Boxes {
+    fn adjective(self) -> &'static str {
+        match self {
+            Self::Detected => "detected boxes",
+            Self::Annotated => "annotated boxes",
+        }
+    }
+}
+
 /// `NAME=FILE.yaml`
 #[derive(Debug, Clone)]
 struct NamedSource {
@@ -120,9 +129,20 @@ impl Arguments {
     pub(crate) fn run(self) -> Result<()> {
         tch::set_num_threads(i32::from(self.threads.max(1)));
         let scenarios = scenarios(&self.data, self.intensity_scale)?;
-        let methods = self.methods()?;
-        let mut boxes = self.box_source(&methods)?;
-        let rows = self.compare(&methods, &mut boxes, &scenarios)?;
+        let mut rows = Vec::new();
+        for (number, &boxes) in self.boxes.iter().enumerate() {
+            let mut methods = self.methods()?;
+            // What exchanges no boxes is compared once.
+            methods.retain(|method| number == 0 || method.needs_boxes);
+            let mut source = self.box_source(boxes, &methods)?;
+            let found = self.compare(&methods, &mut source, &scenarios)?;
+            rows.extend(found.into_iter().zip(&methods).map(|(row, method)| {
+                match self.boxes.len() > 1 && method.needs_boxes {
+                    true => Row { method: format!("{}, {}", row.method, boxes.adjective()), ..row },
+                    false => row,
+                }
+            }));
+        }
         if self.json {
             output::line(serde_json::to_string_pretty(&rows)?)?;
         } else {
@@ -162,8 +182,8 @@ impl Arguments {
         Ok(Poses::spec("icp-map", Measured::Gnss, build))
     }
 
-    fn box_source(&self, methods: &[AlignmentSpec]) -> Result<BoxSource> {
-        if self.boxes == Boxes::Annotated || !methods.iter().any(|method| method.needs_boxes) {
+    fn box_source(&self, boxes: Boxes, methods: &[AlignmentSpec]) -> Result<BoxSource> {
+        if boxes == Boxes::Annotated || !methods.iter().any(|method| method.needs_boxes) {
             return Ok(BoxSource::Annotated);
         }
         let Some(weights) = &self.weights else {

@@ -137,6 +137,7 @@ fn scenario(
         missing,
         lidar_variants: Vec::new(),
         has_radar: false,
+        cameras: Vec::new(),
         layout: sides.kind.layout(),
         source_handedness: Handedness::Right,
         source: Arc::new(Source { sides, pairs: kept, sweeps }),

@@ -199,6 +199,7 @@ impl Builder<'_> {
             missing,
             lidar_variants: Vec::new(),
             has_radar: false,
+            cameras: Vec::new(),
             layout: self.layout,
             source_handedness: Handedness::Right,
             source: Arc::new(Source { root: self.root.to_owned(), layout: self.layout, moments: contents, sweeps }),

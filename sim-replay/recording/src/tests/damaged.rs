@@ -121,7 +121,7 @@ fn only_the_damaged_message_outside_of_chunks_is_left_out() {
 #[test]
 fn a_chunk_that_asks_for_a_huge_window_is_refused() {
     let folder = tempfile::tempdir().unwrap();
-    let options = RecordingOptions { zstd_level: Some(1), with_ros: false };
+    let options = RecordingOptions { zstd_level: Some(1), contents: Contents::Messages };
     let mut bytes = recorded(3, 100, options);
     let frame = bytes.windows(4).position(|bytes| bytes == [0x28, 0xb5, 0x2f, 0xfd]).unwrap();
     // The window descriptor of the frame: 2 GiB. zstd itself allows a stream 128 MiB, and checks before it allocates.
@@ -136,7 +136,7 @@ fn a_chunk_that_asks_for_a_huge_window_is_refused() {
 #[test]
 fn a_record_that_reaches_beyond_its_chunk_is_refused() {
     let folder = tempfile::tempdir().unwrap();
-    let mut bytes = recorded(1, 100, RecordingOptions { zstd_level: None, with_ros: false });
+    let mut bytes = recorded(1, 100, RecordingOptions { zstd_level: None, contents: Contents::Messages });
     let number = |bytes: &[u8], at: usize| u64::from_le_bytes(bytes[at..at + 8].try_into().unwrap());
     // Two times are followed by the unpacked length, the checksum (0: none), an empty name of the compression, the
     // length.
@@ -154,7 +154,7 @@ proptest! {
 
     #[test]
     fn a_cut_recording_reads_up_to_its_last_whole_chunk(at in 0.0_f64..1.0, packed: bool) {
-        let options = RecordingOptions { zstd_level: packed.then_some(1), with_ros: true };
+        let options = RecordingOptions { zstd_level: packed.then_some(1), contents: Contents::All };
         let whole = recorded(4, 40, options);
         let folder = tempfile::tempdir().unwrap();
         let cut = (at * whole.len() as f64) as usize;

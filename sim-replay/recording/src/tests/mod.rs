@@ -1,6 +1,7 @@
 //! Recordings written, read back, truncated and on a full disk.
 
 mod damaged;
+mod export;
 mod public_reader;
 
 use std::io::{self, Write};
@@ -147,7 +148,7 @@ fn write(folder: &Path, bytes: &[u8]) -> PathBuf {
 fn messages_read_equal_those_written() {
     for zstd_level in [None, Some(1)] {
         let folder = tempfile::tempdir().unwrap();
-        let options = RecordingOptions { zstd_level, with_ros: true };
+        let options = RecordingOptions { zstd_level, contents: Contents::All };
         let path = write(folder.path(), &recorded(3, 100, options));
         let recording = Recording::open(&path).unwrap();
         assert_eq!(recording.damage(), []);
@@ -157,7 +158,7 @@ fn messages_read_equal_those_written() {
             assert_eq!((&entry.key, &recording.read(entry).unwrap()), (key, payload));
             assert_eq!(entry.arrived_nanos, 1_000 + entry.header.stamp.sequence);
         }
-        let names: Vec<_> = AGENTS.map(|cav| format!("/{cav}/points")).into();
+        let names: Vec<_> = AGENTS.map(|cav| format!("/cav_{cav}/points")).into();
         let topics: Vec<String> = messages_of(&recording).into_iter().map(|(topic, _, _)| topic).collect();
         assert!(names.iter().all(|name| topics.contains(name)), "{topics:?}");
         assert!(has_index(&path));
@@ -179,7 +180,7 @@ fn sweeps_in_map_coordinates_are_converted_for_ros_tools_too() {
     let folder = tempfile::tempdir().unwrap();
     let recording = Recording::open(&write(folder.path(), &disk.bytes())).unwrap();
     let messages = messages_of(&recording);
-    let converted: Vec<_> = messages.iter().filter(|(topic, ..)| topic == "/4279/points").collect();
+    let converted: Vec<_> = messages.iter().filter(|(topic, ..)| topic == "/cav_4279/points").collect();
     assert_eq!((messages.len(), converted.len()), (3, 1), "a NaN is recorded unchanged");
     let north = 5_428_000.0_f32.to_le_bytes();
     assert!(converted[0].2.windows(4).any(|bytes| bytes == north));

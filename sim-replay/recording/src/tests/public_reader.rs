@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use super::{RecordingOptions, pose, recorded, write};
+use super::{Contents, RecordingOptions, pose, recorded, write};
 
 /// The public reader and a decoder of ROS 2 messages, if Python has them.
 fn public_reader(path: &Path) -> Option<serde_json::Value> {
@@ -36,13 +36,13 @@ fn assert_near(found: &serde_json::Value, expected: &[f64]) {
 fn the_public_reader_and_a_ros_decoder_find_the_same_numbers() {
     for zstd_level in [None, Some(3)] {
         let folder = tempfile::tempdir().unwrap();
-        let path = write(folder.path(), &recorded(3, 100, RecordingOptions { zstd_level, with_ros: true }));
+        let path = write(folder.path(), &recorded(3, 100, RecordingOptions { zstd_level, contents: Contents::All }));
         let Some(found) = public_reader(&path) else { return };
         // Of each tick: two sweeps, two recorded poses, a ground truth; for ROS two clouds, boxes and transforms.
         assert_eq!(found["indexed"], serde_json::json!({"chunks": 3, "messages": 27}));
         assert_eq!(found["messages"]["v2v/test/4279/lidar"], 3);
-        let points = &found["last"]["/4288/points"];
-        assert_eq!((&points["frame"], &points["points"]), (&"4288/lidar".into(), &100.into()));
+        let points = &found["last"]["/cav_4288/points"];
+        assert_eq!((&points["frame"], &points["points"]), (&"cav_4288/lidar".into(), &100.into()));
         assert_near(&serde_json::json!([points["stamp_s"]]), &[0.3]);
         assert_near(&points["last"], &[99.0, 2.0, 0.5, 0.25]);
         assert_near(&points["sums"], &[4950.0, 200.0, 50.0, 25.0]);
@@ -52,7 +52,7 @@ fn the_public_reader_and_a_ros_decoder_find_the_same_numbers() {
         assert_near(&object["size"], &[4.0, 1.8, 1.6]);
         assert_near(&object["wxyz"], &[0.05_f64.cos(), 0.0, 0.0, 0.05_f64.sin()]);
         let transform = &found["last"]["/tf"][1];
-        assert_eq!(transform["child"], "4288/truth");
+        assert_eq!(transform["child"], "cav_4288/truth");
         assert_near(&transform["position"], &pose(2).translation_m);
         assert_near(&transform["wxyz"], &pose(2).rotation_wxyz);
     }

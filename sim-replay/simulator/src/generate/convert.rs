@@ -125,7 +125,7 @@ fn write_moments(
 
 /// The frames of a capture time. No layout can hold sweeps without a pose.
 fn read(scenario: &Scenario, index: usize) -> LoadedTick {
-    let options = LoadOptions { lidar_variant: None, points: true, radar: true };
+    let options = LoadOptions { lidar_variant: None, points: true, radar: true, cameras: true };
     let mut loaded = scenario.load_tick(index, 0..scenario.agents.len(), &options);
     for (agent, _) in loaded.frames.extract_if(.., |(_, frame)| frame.world_from_lidar.is_none()) {
         let path = scenario.points_path(agent, index, None).unwrap_or_default();

@@ -39,6 +39,9 @@ pub(crate) fn protocol_yaml(options: &SynthOptions, spec: &SceneSpec, map_model:
         layout => format!("  layout: {}\n", layout.name()),
     };
     let map = map_yaml(&map_model.findings);
+    let cameras = options.cameras.map_or_else(String::new, |size| {
+        format!("      camera:\n        fov: 100\n        image_size: {size}\n        num: 4\n")
+    });
     format!(
         "\
 description: generated scene, no recording
@@ -81,7 +84,7 @@ generator:
         range: 150
         red_channel_mps: [-64, 64]
         vertical_fov: 30
-world:
+{cameras}world:
   fixed_delta_seconds: {STEP_S}
   seed: {seed}
   sync_mode: true

@@ -3,7 +3,7 @@
 //! [`generate`] writes scenes in a [`SceneLayout`], by default OPV2V's, and the readers of `dataset` read them like any
 //! other data set. [`convert`] writes an opened data set in such a layout. The stages, in order: a static
 //! [`crate::map`], parked vehicles, traffic that is recorded step by step, then for each agent and frame the [`lidar`],
-//! the [`radar`] and the receivers, all of them over one ray caster ([`raycast`]), and the writer of the layout.
+//! the [`radar`], the cameras and the receivers, all of them over one ray caster ([`raycast`]), and the writer of the layout.
 //!
 //! ```no_run
 //! use simulator::generate::{Subset, SynthOptions, generate};
@@ -17,6 +17,7 @@
 //! ```
 
 mod cache;
+mod camera;
 mod convert;
 mod data_protocol;
 mod error;
@@ -37,6 +38,7 @@ pub mod weather;
 mod world;
 
 pub use cache::{are_kept, generate_whole};
+pub use camera::ImageSize;
 pub use convert::{ConvertOptions, Converted, convert};
 pub use error::SynthError;
 pub use layout::SceneLayout;

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 
 use clap::ValueEnum;
 
+use super::camera::ImageSize;
 use super::error::SynthError;
 use super::layout::SceneLayout;
 use super::traffic::STEP_S;
@@ -62,6 +63,8 @@ pub struct SynthOptions {
     pub weather: Weather,
     /// Weathers in which every sweep is written once more, beside the plain one ([`Weather::variant`]).
     pub copies: Vec<Weather>,
+    /// Size of the images of the four cameras; `None`: no cameras.
+    pub cameras: Option<ImageSize>,
     /// Frames of each scenario.
     pub frames: usize,
     /// Simulated time from one stored frame to the next, seconds; a multiple of 0.05.
@@ -88,6 +91,7 @@ impl SynthOptions {
             agents: 2..=4,
             weather: Weather::Sunny,
             copies: Vec::new(),
+            cameras: None,
             frames: Self::default_frames(subset),
             period_s: 0.1,
             force: false,
@@ -142,6 +146,11 @@ impl SynthOptions {
             copies.join(","),
             "expected none, as the layout opv2v alone has copies of sweeps",
         )?;
+        let images = self.cameras.map_or("none".to_owned(), |size| size.to_string());
+        let are_small = self.cameras.is_none_or(|size| size.edges_px().iter().all(|edge| (16..=4096).contains(edge)));
+        check(are_small, "--cameras", images.clone(), "expected 16 to 4096 pixels along each edge")?;
+        let have_place = self.cameras.is_none() || self.layout == SceneLayout::Opv2v;
+        check(have_place, "--cameras", images, "expected none, as images are written in the layout opv2v alone")?;
         let agents = format!("{}-{}", self.agents.start(), self.agents.end());
         let is_range = *self.agents.start() >= 1 && self.agents.start() <= self.agents.end() && *self.agents.end() <= 7;
         check(is_range, "--agents", agents.clone(), "expected a number or a range within 1-7")?;

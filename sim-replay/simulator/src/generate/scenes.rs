@@ -191,7 +191,7 @@ impl Scene<'_, '_> {
         let (next, done) = (AtomicUsize::new(0), AtomicUsize::new(0));
         let total = Mutex::new(Ok(Summary::default()));
         let work = || {
-            let mut bench = Bench::default();
+            let mut bench = Bench::new(self.world, self.options.cameras);
             loop {
                 let index = next.fetch_add(1, Ordering::Relaxed);
                 if index >= moments {

@@ -1,8 +1,9 @@
 //! Sensor simulation: the frames of all agents at one capture time.
 
 use nalgebra::Vector3;
-use protocol::{Handedness, PointCloud, Pose};
+use protocol::{Camera, Handedness, PointCloud, Pose};
 
+use super::camera::{self, CameraRig, GroundPaint, ImageSize, Surroundings};
 use super::layout::{AgentFrame, BoxAnchor, Moment, SceneLayout, Simulated, SweepVariant};
 use super::lidar::{LIDAR_MOUNT_M, Lidar, lidar_motion};
 use super::radar::{Radar, velocity_to_red};
@@ -11,6 +12,7 @@ use super::recording::{Moving, RecordedFrame, Recording};
 use super::scenes::{Agent, Scene, capture_nanos};
 use super::traffic::STEP_S;
 use super::vehicle::{Vehicle, VehicleKind};
+use super::world::World;
 use dataset::frame::{Frame, Object, ObjectClass};
 use support::random::derive_seed;
 
@@ -27,10 +29,18 @@ struct Annotation<'a> {
 }
 
 /// The sensors and buffers of one thread.
-#[derive(Default)]
-pub(super) struct Bench {
+pub(super) struct Bench<'w> {
     lidar: Lidar,
     radar: Radar,
+    cameras: Option<(CameraRig, GroundPaint<'w>)>,
+}
+
+impl<'w> Bench<'w> {
+    /// Sensors in a world, with cameras of this image size.
+    pub(super) fn new(world: &'w World<'w>, cameras: Option<ImageSize>) -> Self {
+        let cameras = cameras.map(|size| (CameraRig::new(size), GroundPaint::new(world)));
+        Self { lidar: Lidar::default(), radar: Radar::default(), cameras }
+    }
 }
 
 /// Points of the LiDAR, copies of them in other weather, and the number of points on each body.
@@ -42,7 +52,13 @@ struct LidarSweeps {
 
 impl Scene<'_, '_> {
     /// The frames of all agents at a capture time.
-    pub(super) fn moment(&self, recording: &Recording, agents: &[Agent], index: usize, bench: &mut Bench) -> Moment {
+    pub(super) fn moment(
+        &self,
+        recording: &Recording,
+        agents: &[Agent],
+        index: usize,
+        bench: &mut Bench<'_>,
+    ) -> Moment {
         let frames = agents.iter().enumerate().filter_map(|(place, agent)| {
             let own = recording.frames[index].of(agent.vehicle)?;
             Some(self.agent_frame(recording, (place, agent), (index, own), bench))
@@ -55,7 +71,7 @@ impl Scene<'_, '_> {
         recording: &Recording,
         (place, agent): (usize, &Agent),
         (index, own): (usize, &Moving),
-        bench: &mut Bench,
+        bench: &mut Bench<'_>,
     ) -> AgentFrame {
         let moment = &recording.frames[index];
         let (mut bodies, seen) = vehicles_around(recording, moment, agent.vehicle);
@@ -69,6 +85,8 @@ impl Scene<'_, '_> {
         let has_radar = self.options.layout == SceneLayout::Opv2v;
         let radar = has_radar.then(|| self.radar_points(&own.motion, half_length_m, &bodies, bench, noise(6)));
 
+        let cameras = self.images(&own.motion.end, &bodies, &seen, bench, noise(8));
+
         let is_hit = |(_, hits): &(Annotation<'_>, &u32)| **hits > 0;
         let mut annotations: Vec<Annotation<'_>> =
             seen.into_iter().zip(&hits).filter(is_hit).map(|(annotation, _)| annotation).collect();
@@ -77,6 +95,7 @@ impl Scene<'_, '_> {
         let frame = Frame {
             points,
             radar,
+            cameras,
             world_from_lidar: Some(own.motion.end.mounted(LIDAR_MOUNT_M).isometry().into()),
             world_from_vehicle: Some(own.motion.end.isometry().into()),
             gnss_world_from_vehicle: Some(fix.estimate.isometry().into()),
@@ -92,7 +111,7 @@ impl Scene<'_, '_> {
         &self,
         vehicle: &Sweep,
         bodies: &[Body<'_>],
-        bench: &mut Bench,
+        bench: &mut Bench<'_>,
         noise: &dyn Fn(u64) -> u64,
     ) -> LidarSweeps {
         let sensor = lidar_motion(vehicle);
@@ -106,13 +125,32 @@ impl Scene<'_, '_> {
         LidarSweeps { points, variants: variants.collect(), hits }
     }
 
+    /// The images of the cameras; `seen` are the annotations of the first bodies.
+    fn images(
+        &self,
+        vehicle: &Placement,
+        bodies: &[Body<'_>],
+        seen: &[Annotation<'_>],
+        bench: &mut Bench<'_>,
+        noise: u64,
+    ) -> Vec<(u8, Camera)> {
+        let Some((rig, ground_paint)) = &mut bench.cameras else { return Vec::new() };
+        let standing = bodies.iter().skip(seen.len()).map(|body| {
+            let [x, y] = [body.motion.end.position_m.x, body.motion.end.position_m.y].map(f64::to_bits);
+            camera::of_shape(body.shape, x ^ y.rotate_left(17))
+        });
+        let paints: Vec<_> = seen.iter().map(|annotation| camera::of_vehicle(annotation.id)).chain(standing).collect();
+        let (ground, weather) = (self.world.ground(), self.options.weather);
+        rig.images(vehicle, &Surroundings { ground, bodies, paints: &paints, weather }, ground_paint, noise)
+    }
+
     /// The radar's points; the fourth value is the radial velocity as stored in the red channel.
     fn radar_points(
         &self,
         vehicle: &Sweep,
         half_length_m: f64,
         bodies: &[Body<'_>],
-        bench: &mut Bench,
+        bench: &mut Bench<'_>,
         noise: u64,
     ) -> PointCloud {
         let ground = self.world.ground();

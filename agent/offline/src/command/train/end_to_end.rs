@@ -15,7 +15,7 @@ pub(crate) struct Args {
     /// Folders of sweeps, all of the same scene.
     #[arg(long, required = true, num_args = 1.., value_name = "DIR")]
     scenes: Vec<PathBuf>,
-    /// Target of the regression: scene-coordinates stands for SGLoc, pose for HypLiLoc and DiffLoc.
+    /// Target of the regression: sgloc regresses coordinates of cells, pose stands for HypLiLoc and DiffLoc.
     #[arg(long, value_enum)]
     regresses: Regresses,
     /// Name of the scene, for messages and the model card.
@@ -36,8 +36,9 @@ pub(crate) struct Args {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 enum Regresses {
-    /// World coordinates of cells, without classification and confidence.
-    SceneCoordinates,
+    /// World coordinates of cells, after SGLoc.
+    #[value(name = "sgloc")]
+    SgLoc,
     /// The pose itself.
     Pose,
 }
@@ -47,7 +48,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     let config = EndToEndTrainConfig {
         scenes: args.scenes.clone(),
         regresses: match args.regresses {
-            Regresses::SceneCoordinates => EndToEndKind::SceneCoordinates,
+            Regresses::SgLoc => EndToEndKind::SgLoc,
             Regresses::Pose => EndToEndKind::Pose,
         },
         scene_name: args.scene_name.clone(),

@@ -29,6 +29,10 @@ pub(crate) struct Args {
     /// Weights of the encoder.
     #[arg(long, value_name = "FILE")]
     encoder: PathBuf,
+    /// Head of the same scene to start from, for example to add sweeps of another weather or season; its sizes replace
+    /// --classes, --centres, --width, --blocks and --no-refiner, its name --scene-name. Name sweeps that it knows among --scenes too.
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["classes", "centres", "width", "blocks", "no_refiner", "scene_name"])]
+    init: Option<PathBuf>,
     /// Name of the scene, for messages and the model card.
     #[arg(long, default_value = "scene")]
     scene_name: String,
@@ -114,6 +118,7 @@ impl Args {
             validation: self.validation.clone(),
             validation_sweeps: self.validation_sweeps,
             encoder: self.encoder.clone(),
+            init: self.init.clone(),
             scene_name: self.scene_name.clone(),
             classes: self.classes,
             centres: self.centres,
@@ -129,7 +134,7 @@ impl Args {
 }
 
 fn card(config: &SceneTrainConfig, summary: &SceneSummary) -> ModelCard {
-    let title = format!("Scene head of {}", config.scene_name);
+    let title = format!("Scene head of {}", summary.scene_name);
     let mut card = ModelCard::new(&title, "World coordinates of cells on the features of a frozen encoder.");
     card.trained(&config.run, &summary.trained, &format!("{} sweeps", summary.sweeps), "cells");
     card.row("of which reading and encoding", format_args!("{:.0} s", summary.preparing_seconds));

@@ -57,7 +57,7 @@ impl Examples for Features {
     fn features(&self, regresses: EndToEndKind) -> Result<Option<Tensor>, LocalizerTrainError> {
         Ok(Some(match regresses {
             EndToEndKind::Pose => self.cache.sweeps.shallow_clone(),
-            EndToEndKind::SceneCoordinates => {
+            EndToEndKind::SgLoc => {
                 self.cache.cells.f_index_select(0, &self.draw(self.cache.cell_count() as usize, SAMPLE)?)?
             }
         }))
@@ -74,10 +74,11 @@ impl Examples for Features {
                 let rows = self.draw(sweeps, self.run.batch)?;
                 pose_loss(network, &self.cache.sweeps.f_index_select(0, &rows)?, &self.truth.select(&rows)?)
             }
-            EndToEndKind::SceneCoordinates => {
+            EndToEndKind::SgLoc => {
                 let rows = self.draw(cells, self.run.batch * CELLS)?;
                 let features = self.cache.cells.f_index_select(0, &rows)?.f_to_kind(Kind::Float)?;
-                coordinate_loss(network, &features, &self.cache.targets_m.f_index_select(0, &rows)?)
+                let sensor_m = self.cache.sensor_m.f_index_select(0, &rows)?;
+                coordinate_loss(network, &features, &sensor_m, &self.cache.targets_m.f_index_select(0, &rows)?)
             }
         };
         self.step += 1;

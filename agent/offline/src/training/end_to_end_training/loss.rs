@@ -8,14 +8,15 @@ use localization::competitors::EndToEnd;
 /// Weight of a unit of heading (about 57 degrees), metres.
 const HEADING_WEIGHT_M: f64 = 30.0;
 
-/// Loss of regressed coordinates: features `[N, cell_channels]` against `[N, 3]` relative to the network's origin,
-/// metres. Also the mean L1 error in metres.
+/// Loss of regressed coordinates: features `[N, cell_channels]` of cells at `[N, 3]` in the sensor frame against
+/// `[N, 3]` relative to the network's origin, metres. Also the mean L1 error in metres.
 pub(super) fn coordinate_loss(
     network: &EndToEnd,
     cells: &Tensor,
+    sensor_m: &Tensor,
     targets_m: &Tensor,
 ) -> Result<(Tensor, f64), TchError> {
-    let error = mean_l1(&network.coordinates(cells)?, targets_m)?;
+    let error = mean_l1(&network.coordinates(cells, sensor_m, true)?, targets_m)?;
     let metres = error.f_double_value(&[])?;
     Ok((error, metres))
 }

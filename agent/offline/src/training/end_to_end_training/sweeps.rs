@@ -68,19 +68,22 @@ impl Examples for Sweeps {
             let truth = Truth::new(batch.iter().map(|example| &example.world_from_sensor), self.origin_m, device)?;
             return Ok(pose_loss(network, &features.sweeps, &truth)?);
         }
-        let (mut rows, mut targets) = (Vec::new(), Vec::new());
+        let (mut rows, mut places, mut targets) = (Vec::new(), Vec::new(), Vec::new());
         for (number, example) in batch.iter().enumerate() {
             let first = voxels.cell_rows(number).start;
             for &row in &example.rows {
-                let place = Point3::from(example.voxels.cells()[row].centroid_m.map(f64::from));
+                let centroid_m = example.voxels.cells()[row].centroid_m;
+                places.extend(centroid_m);
+                let place = Point3::from(centroid_m.map(f64::from));
                 let place = example.world_from_sensor * place - Vector3::from(self.origin_m);
                 rows.push(first + row as i64);
                 targets.extend(place.coords.iter().map(|&axis| axis as f32));
             }
         }
         let rows = Tensor::f_from_slice(&rows)?.f_to_device(device)?;
-        let targets = Tensor::f_from_slice(&targets)?.f_view([-1, 3])?.f_to_device(device)?;
-        Ok(coordinate_loss(network, &features.cells.f_index_select(0, &rows)?, &targets)?)
+        let points = |values: &[f32]| Tensor::f_from_slice(values)?.f_view([-1, 3])?.f_to_device(device);
+        let cells = features.cells.f_index_select(0, &rows)?;
+        Ok(coordinate_loss(network, &cells, &points(&places)?, &points(&targets)?)?)
     }
 }
 

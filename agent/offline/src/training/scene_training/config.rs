@@ -17,7 +17,9 @@ pub struct SceneTrainConfig {
     pub validation_sweeps: usize,
     /// Weights of the encoder.
     pub encoder: PathBuf,
-    /// Name of the scene.
+    /// Head of the same scene to start from; its sizes replace those below. `None`: random weights.
+    pub init: Option<PathBuf>,
+    /// Name of the scene; a head to start from keeps its own.
     pub scene_name: String,
     /// Clusters of sensor positions.
     pub classes: i64,
@@ -76,6 +78,8 @@ pub struct SceneSummary {
     pub trained: Trained,
     /// Seconds before the head's first step.
     pub preparing_seconds: f64,
+    /// Name of the scene, as in the head.
+    pub scene_name: String,
     /// Number of training sweeps.
     pub sweeps: usize,
     /// Number of cells in all batches.

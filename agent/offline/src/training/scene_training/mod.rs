@@ -4,6 +4,7 @@ mod cell_order;
 mod classifier;
 mod coarse_pose;
 mod config;
+mod continued;
 mod features;
 mod key_grid;
 mod losses;
@@ -19,6 +20,7 @@ pub use self::config::{SceneReport, SceneSummary, SceneTrainConfig};
 
 use self::cell_order::CellOrder;
 use self::coarse_pose::CoarsePoses;
+use self::continued::StoredHead;
 use self::features::Features;
 use self::losses::{centre_loss, weighted_loss};
 use super::error::LocalizerTrainError;
@@ -95,14 +97,28 @@ impl<'a> Training<'a> {
         let run = &config.run;
         run.start()?;
         let features = Features::compute(config, observe)?;
-        let head_config = head_config(config, &features)?;
-        let Features { training: cache, validation, data, .. } = features;
+        let stored = config.init.as_ref().map(|init| StoredHead::load(init, &config.encoder, &features.encoder_sha256));
+        let stored = stored.transpose()?;
+        let head_config = match &stored {
+            Some(stored) => stored.config.clone(),
+            None => head_config(config, &features)?,
+        };
+        let Features { training: mut cache, validation, data, .. } = features;
+        cache.move_origin(head_config.origin_m)?;
         let variables = VarStore::new(run.device);
         let mut head = SceneHead::new(&variables.root(), &head_config)?;
-        let positions: Vec<[f64; 3]> =
-            cache.world_from_sensor.iter().map(|pose| pose.translation.vector.into()).collect();
-        let (_, class_of_sweep) = kmeans(&positions, config.classes as usize, run.seed);
-        statistics::set_statistics(&mut head, &cache, run.seed)?;
+        let class_of_sweep = match &stored {
+            Some(stored) => {
+                stored.copy_into(&variables)?;
+                continued::classes_of_sweeps(&head, &cache)?
+            }
+            None => {
+                statistics::set_statistics(&mut head, &cache, run.seed)?;
+                let positions: Vec<[f64; 3]> =
+                    cache.world_from_sensor.iter().map(|pose| pose.translation.vector.into()).collect();
+                kmeans(&positions, config.classes as usize, run.seed).1
+            }
+        };
         if !run.resume {
             let share = classifier::train_classifier(&head, &variables, &cache, &class_of_sweep, run.seed)?;
             observe(&SceneReport::Classified(share));
@@ -218,7 +234,11 @@ impl<'a> Training<'a> {
     }
 
     fn finish(mut self) -> Result<SceneSummary, LocalizerTrainError> {
-        let variables = key_grid::crop(&mut self.head_config, self.variables, &self.cache.targets_m)?;
+        let variables = match self.config.init {
+            // Cropped already, to the sweeps of its first training, which may have been elsewhere in the scene.
+            Some(_) => self.variables,
+            None => key_grid::crop(&mut self.head_config, self.variables, &self.cache.targets_m)?,
+        };
         let about = BTreeMap::from([
             (CONFIG_KEY.to_owned(), serde_json::to_string(&self.head_config).expect("a configuration is JSON")),
             (KIND_KEY.to_owned(), SceneHead::KIND.to_owned()),
@@ -226,6 +246,7 @@ impl<'a> Training<'a> {
         Ok(SceneSummary {
             trained: self.trainer.save_weights(&variables, about, self.data)?,
             preparing_seconds: self.preparing_seconds,
+            scene_name: self.head_config.scene_name,
             sweeps: self.cache.sweep_count(),
             cells_shown: self.cells_shown,
             accuracy: self.accuracy,

@@ -5,7 +5,8 @@
 use std::fmt::Write as _;
 use std::path::Path;
 
-use protocol::{EgoMotion, PointCloud, Pose};
+use dataset::camera_files::body_from_optical;
+use protocol::{Camera, CameraMetadata, EgoMotion, Pinhole, PointCloud, Pose};
 
 use super::agent_folders::{AgentFolderWriter, AgentFolders};
 use super::disk::write_file;
@@ -32,6 +33,10 @@ fn write_files(folders: &AgentFolders, moment: &Moment, frame: &AgentFrame) -> R
     if let Some(radar) = &frame.frame.radar {
         write_file(&folders.file(moment, frame, "_radar.pcd"), pcd_of(&radar.xyzi, IntensityField::Red))?;
     }
+    for (number, Camera { metadata, image }) in &frame.frame.cameras {
+        let ending = metadata.format.name();
+        write_file(&folders.file(moment, frame, &format!("_camera{number}.{ending}")), image)?;
+    }
     write_file(&folders.file(moment, frame, ".yaml"), frame_yaml(frame, folders.is_roadside(frame)))
 }
 
@@ -53,6 +58,9 @@ fn six(pose: &Pose) -> [f64; 6] {
 fn write_frame(yaml: &mut String, agent: &AgentFrame, is_roadside: bool) -> std::fmt::Result {
     let frame = &agent.frame;
     writeln!(yaml, "RSU: {is_roadside}")?;
+    for (number, camera) in &frame.cameras {
+        write_camera(yaml, *number, camera, frame.world_from_lidar.as_ref())?;
+    }
     if let Some(speed_mps) = frame.speed_mps {
         writeln!(yaml, "ego_speed: {}", KMH_PER_MPS * speed_mps)?;
     }
@@ -72,6 +80,33 @@ fn write_frame(yaml: &mut String, agent: &AgentFrame, is_roadside: bool) -> std:
         }
     }
     write_vehicles(yaml, agent)
+}
+
+/// Calibration of a camera: its pose in the world, `extrinsic` from the LiDAR to the camera, both left-handed with x
+/// ahead, and `intrinsic`.
+fn write_camera(yaml: &mut String, number: u8, camera: &Camera, world_from_lidar: Option<&Pose>) -> std::fmt::Result {
+    let CameraMetadata { pinhole, lidar_from_camera, .. } = camera.metadata;
+    let (Some(pinhole), Some(lidar_from_camera), Some(world_from_lidar)) =
+        (pinhole, lidar_from_camera, world_from_lidar)
+    else {
+        return Ok(());
+    };
+    let lidar_from_body = lidar_from_camera.isometry() * body_from_optical().inverse();
+    let world_from_body = CarlaPose::from_pose(&(world_from_lidar.isometry() * lidar_from_body).into());
+    let [world_from_body_left, world_from_lidar_left] =
+        [&world_from_body, &CarlaPose::from_pose(world_from_lidar)].map(CarlaPose::left_handed_matrix);
+    let extrinsic = world_from_body_left.try_inverse().unwrap_or_default() * world_from_lidar_left;
+    writeln!(yaml, "camera{number}:")?;
+    let cords: [f64; 6] = world_from_body.into();
+    write_list(yaml, "  ", "cords", &cords)?;
+    write_rows(yaml, "extrinsic", extrinsic.row_iter().map(|row| row.iter().copied().collect()))?;
+    let Pinhole { fx_px, fy_px, cx_px, cy_px } = pinhole;
+    write_rows(yaml, "intrinsic", [vec![fx_px, 0.0, cx_px], vec![0.0, fy_px, cy_px], vec![0.0, 0.0, 1.0]].into_iter())
+}
+
+fn write_rows(yaml: &mut String, key: &str, mut rows: impl Iterator<Item = Vec<f64>>) -> std::fmt::Result {
+    writeln!(yaml, "  {key}:")?;
+    rows.try_for_each(|row| writeln!(yaml, "  - {row:?}"))
 }
 
 fn write_receivers(yaml: &mut String, fix: &Fix) -> std::fmt::Result {

@@ -1,0 +1,38 @@
+//! LightLoc (Li et al. 2025): classification and regression of scene coordinates without the predicted error, the
+//! refinement and the confidence that PGC adds.
+
+use std::time::Instant;
+
+use protocol::PointCloud;
+
+use crate::pgc::pose_solver::PoseSolver;
+use crate::pgc::{Localization, Localize, Localizer, LocalizerError};
+
+/// The localizer's networks, whose coordinates go through a solver with equal weights.
+///
+/// Departs from LightLoc in that the networks are PGC's: they were trained to predict their error and towards centres
+/// too.
+#[derive(Debug)]
+pub struct LightLoc {
+    localizer: Localizer,
+    solver: PoseSolver,
+}
+
+impl LightLoc {
+    /// The coordinates of `localizer`, the search of `solver`.
+    #[must_use]
+    pub fn new(localizer: Localizer, solver: PoseSolver) -> Self {
+        Self { localizer, solver }
+    }
+}
+
+impl Localize for LightLoc {
+    fn localize(&mut self, cloud: &PointCloud) -> Result<Localization, LocalizerError> {
+        let (mut coordinates, mut times) = self.localizer.scene_coordinates(cloud)?;
+        coordinates.epsilon_m.fill(0.0);
+        let start = Instant::now();
+        let solved = self.solver.solve(&coordinates);
+        times.solve = start.elapsed();
+        Ok(Localization::new(&solved, times))
+    }
+}

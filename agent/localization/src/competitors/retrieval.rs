@@ -1,0 +1,104 @@
+//! Retrieval: the pose of the training sweep that looks most alike, the floor of every localizer that regresses.
+//!
+//! A regression that does not beat it has learnt less than the poses of its training sweeps (Sattler et al. 2019).
+
+use std::time::Instant;
+
+use nalgebra::Isometry3;
+use protocol::{NoPoseReason, PointCloud, PoseEstimate};
+
+use crate::pgc::{Localization, Localize, Localizer, LocalizerError, LocalizerTimes};
+
+/// Smallest deviation of a channel: constant ones are scaled as if they had this one.
+const LEAST_DEVIATION: f32 = 1e-4;
+
+/// Descriptors of sweeps with their poses.
+#[derive(Debug, Clone)]
+pub struct SweepDatabase {
+    mean: Vec<f32>,
+    scale: Vec<f32>,
+    /// Normalised, one after another.
+    descriptors: Vec<f32>,
+    world_from_sensor: Vec<Isometry3<f64>>,
+}
+
+impl SweepDatabase {
+    /// A database of descriptors of equal length; `None` if there is none or they are empty.
+    #[must_use]
+    pub fn new(sweeps: &[(Vec<f32>, Isometry3<f64>)]) -> Option<Self> {
+        let channels = sweeps.first().map(|(descriptor, _)| descriptor.len()).filter(|&channels| channels > 0)?;
+        let count = sweeps.len() as f32;
+        let mean_of = |value: &dyn Fn(&[f32]) -> f32| sweeps.iter().map(|(of, _)| value(of)).sum::<f32>() / count;
+        let mean: Vec<f32> = (0..channels).map(|channel| mean_of(&|of| of[channel])).collect();
+        let variance = |channel: usize| mean_of(&|of| (of[channel] - mean[channel]).powi(2));
+        let scale = (0..channels).map(|channel| 1.0 / variance(channel).sqrt().max(LEAST_DEVIATION)).collect();
+        let mut database = Self { mean, scale, descriptors: Vec::new(), world_from_sensor: Vec::new() };
+        for (descriptor, world_from_sensor) in sweeps {
+            let normalised = database.normalise(descriptor);
+            database.descriptors.extend(normalised);
+            database.world_from_sensor.push(*world_from_sensor);
+        }
+        Some(database)
+    }
+
+    /// Pose of the sweep whose descriptor is nearest.
+    #[must_use]
+    pub fn nearest(&self, descriptor: &[f32]) -> Isometry3<f64> {
+        let wanted = self.normalise(descriptor);
+        let distance = |stored: &[f32]| stored.iter().zip(&wanted).map(|(a, b)| (a - b).powi(2)).sum::<f32>();
+        let distances = self.descriptors.chunks_exact(self.mean.len()).map(distance);
+        let nearest = distances.enumerate().min_by(|(_, a), (_, b)| a.total_cmp(b));
+        nearest.map_or_else(Isometry3::identity, |(row, _)| self.world_from_sensor[row])
+    }
+
+    fn normalise(&self, descriptor: &[f32]) -> Vec<f32> {
+        let channels = descriptor.iter().zip(&self.mean).zip(&self.scale);
+        channels.map(|((value, mean), scale)| (value - mean) * scale).collect()
+    }
+}
+
+/// Retrieval with the features of the localizer's encoder as descriptor.
+#[derive(Debug)]
+pub struct Retrieval {
+    localizer: Localizer,
+    database: SweepDatabase,
+}
+
+impl Retrieval {
+    /// Retrieval from a database of descriptors of the same localizer ([`Localizer::sweep_features`]).
+    #[must_use]
+    pub fn new(localizer: Localizer, database: SweepDatabase) -> Self {
+        Self { localizer, database }
+    }
+}
+
+impl Localize for Retrieval {
+    /// Every pose has full confidence: nothing tells a good one from a bad one.
+    fn localize(&mut self, cloud: &PointCloud) -> Result<Localization, LocalizerError> {
+        let mut times = LocalizerTimes::default();
+        let Some(descriptor) = self.localizer.sweep_features(cloud, &mut times)? else {
+            let none = PoseEstimate::NoPose { reason: NoPoseReason::TooFewPoints, inlier_count: 0 };
+            return Ok(Localization::from_estimate(none, times));
+        };
+        let start = Instant::now();
+        let pose = self.database.nearest(&descriptor);
+        times.solve = start.elapsed();
+        Ok(Localization::from_estimate(PoseEstimate::new(pose.into(), 1.0), times))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_nearest_descriptor_is_found_whatever_the_scale_of_a_channel() {
+        let place = |x: f64| Isometry3::translation(x, 0.0, 0.0);
+        let sweeps =
+            vec![(vec![0.0, 1000.0], place(1.0)), (vec![1.0, 1001.0], place(2.0)), (vec![0.5, 3000.0], place(3.0))];
+        let database = SweepDatabase::new(&sweeps).unwrap();
+        assert_eq!(database.nearest(&[0.9, 1300.0]), place(2.0));
+        assert_eq!(database.nearest(&[0.9, 2900.0]), place(3.0));
+        assert!(SweepDatabase::new(&[]).is_none() && SweepDatabase::new(&[(vec![], place(0.0))]).is_none());
+    }
+}

@@ -1,0 +1,103 @@
+//! Head after SGLoc (Li et al. 2023): attention between scales, residual layers with batch normalisation, and a shift
+//! of each cell's own position.
+
+use tch::nn::{self, BatchNormConfig, ModuleT};
+use tch::{Kind, TchError, Tensor};
+
+use crate::pgc::SceneEncoderConfig;
+use crate::pgc::dense::Dense;
+
+/// Channels inside the head.
+const WIDTH: i64 = 768;
+/// Residual blocks of two layers.
+const BLOCKS: usize = 2;
+/// Unit of positions in the sensor frame that enter the head, metres.
+const POSITION_SCALE_M: f64 = 10.0;
+/// Unit of the shift, metres.
+const SHIFT_SCALE_M: f64 = 100.0;
+
+/// World coordinates of cells, one hypothesis each.
+#[derive(Debug)]
+pub(super) struct SgLocHead {
+    /// Channels of each scale, from fine cells to the widest surroundings.
+    scales: Vec<i64>,
+    /// One logit from each scale.
+    squeeze: Vec<Dense>,
+    inward: Layer,
+    blocks: Vec<[Layer; 2]>,
+    outward: Dense,
+}
+
+/// A dense layer with batch normalisation.
+#[derive(Debug)]
+struct Layer {
+    dense: Dense,
+    norm: nn::BatchNorm,
+}
+
+impl Layer {
+    fn new(path: &nn::Path<'_>, inputs: i64) -> Self {
+        Self {
+            dense: Dense::new(path, inputs, WIDTH, 1.0),
+            norm: nn::batch_norm1d(path / "norm", WIDTH, BatchNormConfig::default()),
+        }
+    }
+
+    fn forward(&self, x: &Tensor, train: bool) -> Result<Tensor, TchError> {
+        Ok(self.norm.forward_t(&self.dense.forward(x)?, train))
+    }
+}
+
+impl SgLocHead {
+    /// Builds the layers below `path`, for the cells of an encoder.
+    pub(super) fn new(path: &nn::Path<'_>, encoder: &SceneEncoderConfig) -> Self {
+        let coarse = encoder.coarse_channels();
+        let fine = encoder.local_channels() - coarse;
+        let surroundings = encoder.context_m.iter().map(|_| coarse);
+        let scales: Vec<i64> =
+            [fine, coarse].into_iter().chain(surroundings).filter(|&channels| channels > 0).collect();
+        let squeeze = |(number, &channels): (usize, &i64)| Dense::new(&(path / "squeeze" / number), channels, 1, 0.1);
+        let block = |number: usize| [0, 1].map(|layer| Layer::new(&(path / "blocks" / number / layer), WIDTH));
+        Self {
+            squeeze: scales.iter().enumerate().map(squeeze).collect(),
+            inward: Layer::new(&(path / "inward"), encoder.cell_channels() + 3),
+            scales,
+            blocks: (0..BLOCKS).map(block).collect(),
+            outward: Dense::new(&(path / "outward"), WIDTH, 3, 0.1),
+        }
+    }
+
+    /// `[N, 3]` world coordinates relative to the origin of the network, metres, of normalised features
+    /// `[N, cell_channels]` of cells at `sensor_m` `[N, 3]`, metres in the sensor frame.
+    ///
+    /// # Errors
+    /// Those of the tensor library.
+    pub(super) fn forward(&self, cells: &Tensor, sensor_m: &Tensor, train: bool) -> Result<Tensor, TchError> {
+        let mut parts = self.weigh(cells)?;
+        parts.push(sensor_m / POSITION_SCALE_M);
+        let mut x = self.inward.forward(&Tensor::f_cat(&parts, 1)?, train)?.f_relu()?;
+        for [first, second] in &self.blocks {
+            let inner = first.forward(&x, train)?.f_relu()?;
+            x = (x + second.forward(&inner, train)?).f_relu()?;
+        }
+        Ok(sensor_m + self.outward.forward(&x)?.f_to_kind(Kind::Float)? * SHIFT_SCALE_M)
+    }
+
+    /// The features scale by scale, each weighted by what it and the fine scale say (tri-scale spatial attention).
+    fn weigh(&self, cells: &Tensor) -> Result<Vec<Tensor>, TchError> {
+        let mut parts = Vec::with_capacity(self.scales.len() + 1);
+        let (mut first, mut own) = (0, None);
+        for (&channels, squeeze) in self.scales.iter().zip(&self.squeeze) {
+            let part = cells.f_narrow(1, first, channels)?;
+            let logit = squeeze.forward(&part)?;
+            let both = match &own {
+                Some(own) => logit.f_add(own)?,
+                None => logit.shallow_clone(),
+            };
+            own.get_or_insert(logit);
+            parts.push(part * both.f_sigmoid()?);
+            first += channels;
+        }
+        Ok(parts)
+    }
+}

@@ -1,0 +1,98 @@
+//! Continued head: a trained head as the start of a training on further sweeps of its scene.
+
+use std::path::Path;
+
+use tch::nn::VarStore;
+use tch::{Kind, TchError, Tensor, no_grad};
+
+use crate::training::{FeatureCache, LocalizerTrainError};
+use localization::pgc::{LocalizerError, SceneHead, SceneHeadConfig};
+use perception::weights::Weights;
+
+/// Number of cells of a sweep that its classification is judged by.
+const CELLS: i64 = 32;
+/// Largest median L1 error of these cells under which a classification is trusted, metres.
+const TRUSTED_M: f64 = 5.0;
+
+/// The head of a file and its configuration.
+pub(super) struct StoredHead {
+    weights: Weights,
+    pub(super) config: SceneHeadConfig,
+}
+
+impl StoredHead {
+    /// Reads a head that was trained on the features of the encoder with this SHA-256.
+    pub(super) fn load(path: &Path, encoder: &Path, encoder_sha256: &str) -> Result<Self, LocalizerError> {
+        let weights = Weights::load(path)?;
+        weights.check_kind(SceneHead::KIND)?;
+        let config: SceneHeadConfig = weights.config()?;
+        if config.encoder_sha256 != encoder_sha256 {
+            return Err(LocalizerError::OtherEncoder {
+                head: path.display().to_string(),
+                expected: config.encoder_sha256,
+                encoder: encoder.display().to_string(),
+                found: encoder_sha256.to_owned(),
+            });
+        }
+        Ok(Self { weights, config })
+    }
+
+    /// Gives a network of the same configuration the weights of the file.
+    pub(super) fn copy_into(&self, variables: &VarStore) -> Result<(), LocalizerError> {
+        Ok(self.weights.copy_into(variables)?)
+    }
+}
+
+/// Class of each sweep of `cache`, which a trained head does not store: the one whose trusted sweeps lie nearest. A
+/// sweep is trusted if the head finds its cells with the class that it gives it.
+pub(super) fn classes_of_sweeps(head: &SceneHead, cache: &FeatureCache) -> Result<Vec<usize>, LocalizerTrainError> {
+    let (classes, errors_m) = no_grad(|| classify(head, cache))?;
+    let positions: Vec<[f64; 3]> = cache.world_from_sensor.iter().map(|pose| pose.translation.vector.into()).collect();
+    let mut sums = vec![[0.0; 4]; head.config().classes as usize];
+    for ((&class, _), position) in
+        classes.iter().zip(&errors_m).zip(&positions).filter(|((_, error_m), _)| **error_m < TRUSTED_M)
+    {
+        (0..3).for_each(|axis| sums[class as usize][axis] += position[axis]);
+        sums[class as usize][3] += 1.0;
+    }
+    let middles: Vec<(usize, [f64; 3])> = sums
+        .iter()
+        .enumerate()
+        .filter(|(_, sum)| sum[3] > 0.0)
+        .map(|(class, sum)| (class, std::array::from_fn(|axis| sum[axis] / sum[3])))
+        .collect();
+    if middles.is_empty() {
+        return Err(LocalizerTrainError::OtherScene(head.config().scene_name.clone()));
+    }
+    Ok(positions.iter().map(|position| nearest(&middles, position)).collect())
+}
+
+/// Class of each sweep as the head sees it, and the median L1 error of some of its cells under it, metres.
+fn classify(head: &SceneHead, cache: &FeatureCache) -> Result<(Vec<i64>, Vec<f64>), TchError> {
+    let logits = head.classify(&cache.sweeps, false)?;
+    let classes = Vec::try_from(&logits.f_argmax(1, false)?)?;
+    let sweep_of_cell: Vec<i64> = Vec::try_from(&cache.sweep_of_cell)?;
+    let first_cell = |sweep: usize| sweep_of_cell.partition_point(|&of| of < sweep as i64) as i64;
+    let errors = (0..cache.sweep_count()).map(|sweep| {
+        let rows = first_cell(sweep)..first_cell(sweep + 1);
+        let count = (rows.end - rows.start).min(CELLS);
+        if count == 0 {
+            return Ok(f64::INFINITY);
+        }
+        let rows =
+            Tensor::f_linspace(rows.start as f64, (rows.end - 1) as f64, count, (Kind::Double, cache.cells.device()))?
+                .f_to_kind(Kind::Int64)?;
+        let cells = head.normalise(&cache.cells.f_index_select(0, &rows)?)?;
+        let of_cells = logits.f_narrow(0, sweep as i64, 1)?.f_expand([count, -1], false)?;
+        let found = head.regress(&cells, &of_cells, Kind::Float)?.coordinates_m;
+        let error = (found - cache.targets_m.f_index_select(0, &rows)?).f_abs()?;
+        error.f_sum_dim_intlist(1_i64, false, Kind::Float)?.f_median()?.f_double_value(&[])
+    });
+    Ok((classes, errors.collect::<Result<_, TchError>>()?))
+}
+
+fn nearest(middles: &[(usize, [f64; 3])], position: &[f64; 3]) -> usize {
+    let square_m2 = |middle: &[f64; 3]| (0..3).map(|axis| (middle[axis] - position[axis]).powi(2)).sum::<f64>();
+    let nearest = middles.iter().min_by(|(_, one), (_, other)| square_m2(one).total_cmp(&square_m2(other)));
+    nearest.map_or(0, |(class, _)| *class)
+}

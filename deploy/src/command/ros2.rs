@@ -1,0 +1,207 @@
+//! `v2vloc ros2`.
+
+use std::path::PathBuf;
+
+use anyhow::Context;
+use bus::shutdown::Stop;
+use bus::{Bus, BusOptions, Credentials, Endpoint, Identity, STOP_LIMIT, open, process_id};
+use deploy::ros::{LidarSource, NodeOptions, NodeReport, RosSession, run};
+use protocol::{CavId, Role, RunId};
+use ros2::{Distribution, Mount, RosName};
+use support::cli::{BadInput, Outcome};
+use support::output;
+
+#[derive(Debug, clap::Args)]
+pub(crate) struct Arguments {
+    /// Router of the run, tcp/HOST:PORT; `v2vloc up` prints it.
+    #[arg(long, default_value = "tcp/127.0.0.1:7447")]
+    connect: Endpoint,
+    /// Name of the run.
+    #[arg(long)]
+    run: RunId,
+    /// Folder with the node's keys, where the run has security (`v2vloc keys` writes DIR/ros2).
+    #[arg(long, value_name = "DIR")]
+    keys: Option<PathBuf>,
+    /// Print a JSON summary.
+    #[arg(long)]
+    json: bool,
+    #[command(flatten)]
+    network: Network,
+    #[command(flatten)]
+    content: Content,
+    #[command(flatten)]
+    lidar: Lidar,
+}
+
+/// The ROS 2 network.
+#[derive(Debug, clap::Args)]
+#[command(next_help_heading = "ROS 2 network")]
+struct Network {
+    /// Router of the ROS 2 network (rmw_zenohd) [default: the router of the run].
+    #[arg(long, value_name = "ENDPOINT")]
+    ros_router: Option<Endpoint>,
+    /// Domain [default: ROS_DOMAIN_ID, or 0].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(0..=232))]
+    domain_id: Option<u32>,
+    /// Namespace of the node and of the topics of vehicles, for example /fleet.
+    #[arg(long, value_name = "/NAME")]
+    namespace: Option<RosName>,
+    /// Distribution of the other nodes: humble writes no type hashes into keys; jazzy stands for all later ones.
+    #[arg(long, value_enum, default_value_t)]
+    distro: Distro,
+}
+
+/// What is published.
+#[derive(Debug, clap::Args)]
+#[command(next_help_heading = "Messages")]
+struct Content {
+    /// Do not offer the sweeps of the vehicles.
+    #[arg(long)]
+    no_points: bool,
+    /// Publish /clock: the capture times, for nodes with use_sim_time [default: true without --lidar].
+    #[arg(long, value_name = "true|false")]
+    clock: Option<bool>,
+    /// Place of the LiDAR on its vehicle, for /tf_static: metres, and optionally its yaw in degrees.
+    #[arg(long, value_name = "X,Y,Z[,YAW]", allow_hyphen_values = true)]
+    lidar_mount: Option<Mount>,
+    /// Publish the first fix of this vehicle on /initialpose, as soon as somebody subscribes to it.
+    #[arg(long, value_name = "AGENT", allow_hyphen_values = true)]
+    initialpose: Option<CavId>,
+}
+
+/// LiDARs of the ROS 2 network.
+#[derive(Debug, clap::Args)]
+#[command(next_help_heading = "LiDARs of the ROS 2 network")]
+struct Lidar {
+    /// Pass the sensor_msgs/PointCloud2 of a topic to an agent as its LiDAR, for example /velodyne_points=1000;
+    /// repeatable.
+    #[arg(long, value_name = "TOPIC=AGENT", allow_hyphen_values = true)]
+    lidar: Vec<LidarSource>,
+    /// Largest intensity of these messages, 255 for many drivers; agents get shares of it, 0 to 1.
+    #[arg(long, value_name = "VALUE", default_value_t = 1.0, value_parser = above_zero)]
+    intensity_max: f32,
+}
+
+/// Distributions of ROS 2 by what their rmw_zenoh writes into keys.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, clap::ValueEnum)]
+enum Distro {
+    /// Without type hashes.
+    Humble,
+    /// With type hashes.
+    #[default]
+    Jazzy,
+}
+
+fn above_zero(text: &str) -> Result<f32, String> {
+    let value: f32 = text.parse().map_err(|_| "not a number".to_owned())?;
+    if value > 0.0 && value.is_finite() { Ok(value) } else { Err("a number above 0".to_owned()) }
+}
+
+impl Arguments {
+    /// Connects the run with the ROS 2 network until Ctrl-C.
+    pub(crate) fn run(self) -> anyhow::Result<Outcome> {
+        self.check()?;
+        let domain_id = self.network.domain_id()?;
+        let stop = Stop::new();
+        stop.on_signals()?;
+        stop.enforce(STOP_LIMIT);
+        let bus = self.join()?;
+        let router = self.network.ros_router.as_ref().unwrap_or(&self.connect);
+        let session = open(&BusOptions::client(router.clone())).context("the ROS 2 network")?;
+        let session = RosSession::declare(session, domain_id, self.network.namespace.clone(), self.distribution())?;
+        output::note(format_args!(
+            "run {} on domain {domain_id} of the ROS 2 network at {router} (Ctrl-C ends it)",
+            self.run
+        ));
+        let report = run(&bus, &session, &self.options(), &stop)?;
+        drop(session);
+        if let Err(overdue) = bus.leave(STOP_LIMIT) {
+            tracing::warn!("{overdue}");
+        }
+        print(&report, self.json)?;
+        Ok(Outcome::of(!report.lidar.is_complete() || report.left_out > 0))
+    }
+
+    /// Two LiDARs of one vehicle would be one.
+    fn check(&self) -> anyhow::Result<()> {
+        let sources = &self.lidar.lidar;
+        for (index, source) in sources.iter().enumerate() {
+            if let Some(other) = sources.iter().take(index).find(|other| other.cav == source.cav) {
+                let (first, second, cav) = (&other.topic, &source.topic, &source.cav);
+                return Err(BadInput::new(format!("--lidar: {first} and {second} are both the LiDAR of {cav}")).into());
+            }
+        }
+        if self.network.ros_router.is_none() && self.keys.is_some() {
+            return Err(
+                BadInput::new("--ros-router: nodes of ROS 2 have no certificates; name a router for them").into()
+            );
+        }
+        Ok(())
+    }
+
+    fn join(&self) -> anyhow::Result<Bus> {
+        let cav = CavId::new("ros2")?;
+        let identity = Identity { run: self.run.clone(), process: process_id(Role::Ros2, &cav), cav };
+        let mut options = BusOptions::client(self.connect.clone());
+        if let Some(folder) = &self.keys {
+            let credentials = Credentials::read(folder)?;
+            credentials.check_name(identity.process.as_str())?;
+            options = options.with_credentials(credentials);
+        }
+        Ok(Bus::join(&options, identity)?)
+    }
+
+    fn distribution(&self) -> Distribution {
+        match self.network.distro {
+            Distro::Humble => Distribution::Humble,
+            Distro::Jazzy => Distribution::Jazzy,
+        }
+    }
+
+    fn options(&self) -> NodeOptions {
+        let (content, lidar) = (&self.content, &self.lidar);
+        NodeOptions {
+            with_points: !content.no_points,
+            // The sweeps of a robot have the time of its clock, not of a scene.
+            with_clock: content.clock.unwrap_or(lidar.lidar.is_empty()),
+            mount: content.lidar_mount.unwrap_or_default(),
+            lidars: lidar.lidar.clone(),
+            max_intensity: lidar.intensity_max,
+            initial_pose_of: content.initialpose.clone(),
+        }
+    }
+}
+
+impl Network {
+    fn domain_id(&self) -> anyhow::Result<u32> {
+        let Some(text) = std::env::var_os("ROS_DOMAIN_ID").filter(|_| self.domain_id.is_none()) else {
+            return Ok(self.domain_id.unwrap_or(0));
+        };
+        let number = text.to_str().and_then(|text| text.parse().ok()).filter(|number| *number <= 232);
+        number.ok_or_else(|| BadInput::new(format!("ROS_DOMAIN_ID is {text:?}, not a number from 0 to 232")).into())
+    }
+}
+
+fn print(report: &NodeReport, as_json: bool) -> anyhow::Result<()> {
+    if as_json {
+        output::line(serde_json::to_string(report)?)?;
+        return Ok(());
+    }
+    for (topic, messages) in &report.published {
+        output::line(format_args!("{messages:>8} {topic}"))?;
+    }
+    let lidar = &report.lidar;
+    if lidar.sweeps > 0 {
+        output::line(format_args!(
+            "{} sweeps passed to agents, {} superseded, {} repeated",
+            lidar.sweeps, lidar.superseded, lidar.repeated
+        ))?;
+    }
+    if lidar.unreadable > 0 {
+        output::line(format_args!("{} messages of LiDARs could not be read", lidar.unreadable))?;
+    }
+    if report.left_out > 0 {
+        output::line(format_args!("{} messages of the run were left out", report.left_out))?;
+    }
+    Ok(())
+}

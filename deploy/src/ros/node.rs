@@ -1,0 +1,312 @@
+//! The node: from a run to a ROS 2 network, until the stop is requested.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::{Scope, ScopedJoinHandle};
+use std::time::{Duration, Instant};
+
+use bus::bounded_queue::{BoundedQueue, Pop};
+use bus::shutdown::Stop;
+use bus::{Bus, BusError, LivelinessEvent, RawMessage};
+use protocol::{CavId, KeyExpr, Kind, Limits, Message, Role, Stream, Topic, wire};
+use ros2::{Mount, RosTopic, Translator, VehicleTopic};
+use serde::Serialize;
+
+use super::initial_pose::InitialPose;
+use super::lidar_input::{LidarInputs, LidarReport, LidarSource};
+use super::publisher::RosPublisher;
+use super::scene_clock::SceneClock;
+use super::session::RosSession;
+use super::sweeps;
+
+/// Messages of one key that may wait.
+const PLACES: usize = 64;
+/// Vehicles that may join or leave at one moment.
+const EVENTS: usize = 256;
+/// Period at which vehicles that have joined or left are looked at.
+const POLL_PERIOD: Duration = Duration::from_millis(50);
+
+/// Options of the node.
+#[derive(Debug, Clone, PartialEq)]
+pub struct NodeOptions {
+    /// True to offer the sweeps of the run's vehicles.
+    pub with_points: bool,
+    /// True to publish `/clock`.
+    pub with_clock: bool,
+    /// Place of the LiDARs on their vehicles.
+    pub mount: Mount,
+    /// LiDARs of the ROS 2 network that are those of agents.
+    pub lidars: Vec<LidarSource>,
+    /// Largest intensity that they publish; passed on are shares of it.
+    pub max_intensity: f32,
+    /// Vehicle whose first fix is published on `/initialpose`.
+    pub initial_pose_of: Option<CavId>,
+}
+
+impl Default for NodeOptions {
+    fn default() -> Self {
+        Self {
+            with_points: true,
+            with_clock: true,
+            mount: Mount::default(),
+            lidars: Vec::new(),
+            max_intensity: 1.0,
+            initial_pose_of: None,
+        }
+    }
+}
+
+/// What the node has done.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
+pub struct NodeReport {
+    /// Messages published, by topic; without sweeps.
+    pub published: BTreeMap<String, u64>,
+    /// Messages of the run that were left out as they could not be read, or came faster than they were published.
+    pub left_out: u64,
+    /// Messages of LiDARs.
+    pub lidar: LidarReport,
+}
+
+/// Connects the run of `bus` with a ROS 2 network until `stop` is requested.
+///
+/// # Errors
+/// [`BusError`] when a session fails. Errors of single messages are counted and logged.
+pub fn run(bus: &Bus, session: &RosSession, options: &NodeOptions, stop: &Stop) -> Result<NodeReport, BusError> {
+    let streams = [Stream::Imu, Stream::Pose, Stream::Detections];
+    let run = &bus.identity().run;
+    let mut selectors: Vec<KeyExpr> = streams.map(|stream| KeyExpr::stream(run, stream)).into();
+    selectors.push(KeyExpr::stats(run));
+    let tap = bus.tap(&selectors, PLACES)?;
+    stop.on_request(tap.closer());
+    let members = Arc::new(BoundedQueue::new(EVENTS, 1));
+    let watched = [Role::Agent, Role::Ego].map(|role| {
+        let members = Arc::clone(&members);
+        // A change beyond those that fit is not noticed: the topics appear with their first message.
+        bus.watch(role, move |event| drop(members.push((), event)))
+    });
+    let _watched = watched.into_iter().collect::<Result<Vec<_>, _>>()?;
+    let inputs = (!options.lidars.is_empty())
+        .then(|| LidarInputs::open(bus, session, &options.lidars, options.max_intensity, stop))
+        .transpose()?;
+    let presence = bus.announce(Role::Ros2)?;
+    let report = std::thread::scope(|scope| {
+        let reading = inputs.map(|inputs| scope.spawn(move || inputs.run()));
+        let followed = follow(scope, (bus, session, options), &tap, &members);
+        // After an error the threads of the LiDARs have to end too.
+        stop.request();
+        let lidar = reading.map(|reading| reading.join().unwrap_or_default()).unwrap_or_default();
+        followed.map(|report| NodeReport { lidar, ..report })
+    })?;
+    presence.withdraw()?;
+    Ok(report)
+}
+
+/// Publishes what the run publishes until `tap` is closed.
+fn follow<'scope, 'env>(
+    scope: &'scope Scope<'scope, 'env>,
+    (bus, session, options): (&'env Bus, &'env RosSession, &'env NodeOptions),
+    tap: &bus::PassiveSubscriber,
+    members: &BoundedQueue<(), LivelinessEvent>,
+) -> Result<NodeReport, BusError> {
+    let mut node = Node::new(scope, bus, session, options)?;
+    let followed = node.follow(tap, members);
+    std::mem::take(&mut node.sweeps).into_values().for_each(Forwarding::end);
+    let left_out = node.left_out + tap.overwritten() + tap.undelivered();
+    followed.map(|()| NodeReport { published: node.published, left_out, lidar: LidarReport::default() })
+}
+
+/// Sweeps of one vehicle, forwarded on a thread of their own.
+struct Forwarding<'scope> {
+    ending: Arc<AtomicBool>,
+    thread: ScopedJoinHandle<'scope, ()>,
+}
+
+/// State of the thread that follows the run.
+struct Node<'scope, 'env> {
+    scope: &'scope Scope<'scope, 'env>,
+    bus: &'env Bus,
+    session: &'env RosSession,
+    options: &'env NodeOptions,
+    translator: Translator,
+    clock: SceneClock,
+    initial_pose: Option<InitialPose>,
+    publishers: BTreeMap<RosTopic, RosPublisher>,
+    sweeps: BTreeMap<CavId, Forwarding<'scope>>,
+    /// Vehicles that have agents.
+    agents: BTreeSet<CavId>,
+    published: BTreeMap<String, u64>,
+    left_out: u64,
+}
+
+impl<'scope, 'env> Node<'scope, 'env> {
+    fn new(
+        scope: &'scope Scope<'scope, 'env>,
+        bus: &'env Bus,
+        session: &'env RosSession,
+        options: &'env NodeOptions,
+    ) -> Result<Self, BusError> {
+        let initial_pose = options.initial_pose_of.clone().map(|cav| InitialPose::of(cav, options.mount));
+        let mut node = Self {
+            scope,
+            bus,
+            session,
+            options,
+            translator: Translator::new(&bus.identity().run),
+            clock: SceneClock::default(),
+            initial_pose,
+            publishers: BTreeMap::new(),
+            sweeps: BTreeMap::new(),
+            agents: BTreeSet::new(),
+            published: BTreeMap::new(),
+            left_out: 0,
+        };
+        let clock = options.with_clock.then_some(RosTopic::Clock);
+        let initial_pose = node.initial_pose.is_some().then_some(InitialPose::TOPIC);
+        let topics = [RosTopic::Tf, RosTopic::TfStatic, RosTopic::Diagnostics].into_iter();
+        topics.chain(clock).chain(initial_pose).try_for_each(|topic| node.declare(topic))?;
+        Ok(node)
+    }
+
+    /// Publishes what the run publishes until the queue is closed.
+    fn follow(
+        &mut self,
+        tap: &bus::PassiveSubscriber,
+        members: &BoundedQueue<(), LivelinessEvent>,
+    ) -> Result<(), BusError> {
+        loop {
+            while let Pop::Item((), event) = members.take(Some(Instant::now())) {
+                self.note(event)?;
+            }
+            match tap.take(Some(Instant::now() + POLL_PERIOD)) {
+                Pop::Item(topic, raw) => self.take(&topic, &raw)?,
+                Pop::TimedOut => {}
+                Pop::Closed => return Ok(()),
+            }
+        }
+    }
+
+    /// A process of a vehicle has joined or left: its topics appear, or disappear.
+    fn note(&mut self, event: LivelinessEvent) -> Result<(), BusError> {
+        match event {
+            LivelinessEvent::Joined { role: Role::Agent, cav } => {
+                self.agents.insert(cav.clone());
+                [VehicleTopic::Pose, VehicleTopic::Odometry]
+                    .into_iter()
+                    .try_for_each(|topic| self.declare(RosTopic::Vehicle(cav.clone(), topic)))?;
+                if self.options.with_points {
+                    self.forward_sweeps(&cav)?;
+                }
+                self.publish_static_transforms()
+            }
+            LivelinessEvent::Joined { cav, .. } => [VehicleTopic::Detections, VehicleTopic::Markers]
+                .into_iter()
+                .try_for_each(|topic| self.declare(RosTopic::Vehicle(cav.clone(), topic))),
+            LivelinessEvent::Left { role: Role::Agent, cav } => {
+                self.agents.remove(&cav);
+                self.withdraw(&cav, &[VehicleTopic::Pose, VehicleTopic::Odometry]);
+                if let Some(forwarding) = self.sweeps.remove(&cav) {
+                    forwarding.end();
+                }
+                self.publish_static_transforms()
+            }
+            LivelinessEvent::Left { cav, .. } => {
+                self.withdraw(&cav, &[VehicleTopic::Detections, VehicleTopic::Markers]);
+                Ok(())
+            }
+        }
+    }
+
+    fn withdraw(&mut self, cav: &CavId, topics: &[VehicleTopic]) {
+        for topic in topics {
+            self.publishers.remove(&RosTopic::Vehicle(cav.clone(), *topic));
+        }
+    }
+
+    /// The frames of the vehicles' bodies: all of them in one message, as only the last is kept for late subscribers.
+    fn publish_static_transforms(&mut self) -> Result<(), BusError> {
+        // The stamp of a fixed transform has no meaning.
+        let cdr = ros2::static_transforms(0, self.agents.iter(), &self.options.mount);
+        self.publish(RosTopic::TfStatic, cdr)
+    }
+
+    fn forward_sweeps(&mut self, cav: &CavId) -> Result<(), BusError> {
+        // The LiDAR comes from the ROS 2 network: its own topic is there.
+        if self.sweeps.contains_key(cav) || self.options.lidars.iter().any(|source| source.cav == *cav) {
+            return Ok(());
+        }
+        let mut publisher = self.session.publisher(&RosTopic::Vehicle(cav.clone(), VehicleTopic::Points))?;
+        let ending = Arc::<AtomicBool>::default();
+        let (bus, vehicle, ended) = (self.bus, cav.clone(), Arc::clone(&ending));
+        let thread = self.scope.spawn(move || {
+            if let Err(error) = sweeps::forward(bus, &vehicle, &mut publisher, &ended) {
+                tracing::error!("sweeps of {vehicle} are no longer published: {error}");
+            }
+        });
+        self.sweeps.insert(cav.clone(), Forwarding { ending, thread });
+        Ok(())
+    }
+
+    fn take(&mut self, topic: &Topic, raw: &RawMessage) -> Result<(), BusError> {
+        let (header, message) = match wire::decode_any(raw.pieces(), &Limits::DEFAULT) {
+            Ok((header, _)) if header.kind == Kind::Control => return Ok(()),
+            Ok(decoded) => decoded,
+            Err(error) => {
+                self.left_out += 1;
+                tracing::warn!("{}: left out: {error}", raw.key);
+                return Ok(());
+            }
+        };
+        let capture_nanos = header.stamp.capture_nanos;
+        if let Topic::Stream { cav, stream } = topic {
+            self.tell_time(cav, *stream, capture_nanos)?;
+            self.tell_initial_pose(cav, capture_nanos, &message)?;
+        }
+        for message in self.translator.translate(topic, capture_nanos, &message) {
+            self.publish(message.topic, message.cdr)?;
+        }
+        Ok(())
+    }
+
+    /// The clock before the message: nothing has a stamp in the future.
+    fn tell_time(&mut self, cav: &CavId, stream: Stream, capture_nanos: u64) -> Result<(), BusError> {
+        match self.clock.advance(cav, stream, capture_nanos).filter(|_| self.options.with_clock) {
+            Some(nanos) => self.publish(RosTopic::Clock, ros2::clock(nanos)),
+            None => Ok(()),
+        }
+    }
+
+    fn tell_initial_pose(&mut self, cav: &CavId, capture_nanos: u64, message: &Message) -> Result<(), BusError> {
+        let Some(initial) = &mut self.initial_pose else { return Ok(()) };
+        let publishers = &self.publishers;
+        let is_wanted = || publishers.get(&InitialPose::TOPIC).is_some_and(RosPublisher::is_wanted);
+        match initial.of_message(cav, capture_nanos, message, is_wanted) {
+            Some(cdr) => self.publish(InitialPose::TOPIC, cdr),
+            None => Ok(()),
+        }
+    }
+
+    fn declare(&mut self, topic: RosTopic) -> Result<(), BusError> {
+        if !self.publishers.contains_key(&topic) {
+            let publisher = self.session.publisher(&topic)?;
+            self.publishers.insert(topic, publisher);
+        }
+        Ok(())
+    }
+
+    fn publish(&mut self, topic: RosTopic, cdr: Vec<u8>) -> Result<(), BusError> {
+        self.declare(topic.clone())?;
+        let name = topic.name(self.session.node().namespace.as_ref()).to_string();
+        *self.published.entry(name).or_default() += 1;
+        self.publishers.get_mut(&topic).map_or(Ok(()), |publisher| publisher.publish(cdr))
+    }
+}
+
+impl Forwarding<'_> {
+    fn end(self) {
+        self.ending.store(true, Ordering::Relaxed);
+        if self.thread.join().is_err() {
+            tracing::error!("the thread of a vehicle's sweeps panicked");
+        }
+    }
+}

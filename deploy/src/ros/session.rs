@@ -1,0 +1,101 @@
+//! Session on a ROS 2 network: a node, its publishers and its subscriptions.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
+
+use bus::BusError;
+use ros2::endpoint::{Endpoint, EndpointKind, Node, gid};
+use ros2::{Distribution, Qos, RosName, RosTopic, RosType};
+use zenoh::liveliness::LivelinessToken;
+use zenoh::sample::Sample;
+use zenoh::{Session, Wait};
+
+use super::publisher::RosPublisher;
+
+/// Name of the node.
+const NODE_NAME: &str = "v2vloc";
+
+/// A node of a ROS 2 network. Its tokens are withdrawn when this is dropped.
+pub struct RosSession {
+    session: Session,
+    node: Node,
+    /// Number of the last endpoint.
+    endpoints: AtomicU32,
+    _token: LivelinessToken,
+}
+
+/// A subscription; ends when dropped.
+pub(super) struct RosSubscription {
+    _subscriber: zenoh::pubsub::Subscriber<()>,
+    _token: LivelinessToken,
+}
+
+impl RosSession {
+    /// Declares the node on an open session.
+    ///
+    /// # Errors
+    /// [`BusError::Zenoh`] when the session is closed.
+    pub fn declare(
+        session: Session,
+        domain_id: u32,
+        namespace: Option<RosName>,
+        distribution: Distribution,
+    ) -> Result<Self, BusError> {
+        let node = Node { domain_id, zid: session.zid().to_string(), namespace, name: NODE_NAME.into(), distribution };
+        let token = declare_token(&session, &node.token())?;
+        Ok(Self { session, node, endpoints: AtomicU32::new(0), _token: token })
+    }
+
+    /// The node.
+    #[must_use]
+    pub fn node(&self) -> &Node {
+        &self.node
+    }
+
+    /// Declares a publisher of `topic`.
+    pub(super) fn publisher(&self, topic: &RosTopic) -> Result<RosPublisher, BusError> {
+        let name = topic.name(self.node.namespace.as_ref());
+        let key = self.node.key(&name, topic.ros_type());
+        let token = self.endpoint_token(EndpointKind::Publisher, name, topic.ros_type(), topic.qos());
+        let declared = declare_token(&self.session, &token)?;
+        RosPublisher::declare(&self.session, &key, topic.qos(), (gid(&token), declared))
+    }
+
+    /// Calls `receive` for every message of a topic, on zenoh's receive thread: it must not wait.
+    pub(super) fn subscribe(
+        &self,
+        topic: &RosName,
+        ros_type: RosType,
+        qos: Qos,
+        receive: impl Fn(Sample) + Send + Sync + 'static,
+    ) -> Result<RosSubscription, BusError> {
+        // Publishers of every distribution are heard, whatever hash they write.
+        let keys = self.node.any_hash(topic, ros_type);
+        let subscriber = self.session.declare_subscriber(&keys).callback(receive).wait();
+        let subscriber = subscriber.map_err(|cause| BusError::zenoh(format!("subscribing to {keys}"), &cause))?;
+        let token = self.endpoint_token(EndpointKind::Subscription, topic.clone(), ros_type, qos);
+        Ok(RosSubscription { _subscriber: subscriber, _token: declare_token(&self.session, &token)? })
+    }
+
+    fn endpoint_token(&self, kind: EndpointKind, topic: RosName, ros_type: RosType, qos: Qos) -> String {
+        let id = self.endpoints.fetch_add(1, Ordering::Relaxed) + 1;
+        self.node.endpoint_token(&Endpoint { id, kind, topic, ros_type, qos })
+    }
+}
+
+fn declare_token(session: &Session, key: &str) -> Result<LivelinessToken, BusError> {
+    let token = session.liveliness().declare_token(key).wait();
+    token.map_err(|cause| BusError::zenoh(format!("declaring {key}"), &cause))
+}
+
+/// True while a publisher has subscribers, updated for its lifetime.
+pub(super) fn has_subscribers(publisher: &zenoh::pubsub::Publisher<'_>) -> zenoh::Result<Arc<AtomicBool>> {
+    let has_subscribers = Arc::<AtomicBool>::default();
+    let noted = Arc::clone(&has_subscribers);
+    let listener = publisher.matching_listener();
+    listener.callback(move |status| noted.store(status.matching(), Ordering::Relaxed)).background().wait()?;
+    if publisher.matching_status().wait()?.matching() {
+        has_subscribers.store(true, Ordering::Relaxed);
+    }
+    Ok(has_subscribers)
+}

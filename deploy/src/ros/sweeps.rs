@@ -1,0 +1,55 @@
+//! Sweeps to a ROS 2 network: of vehicles whose points somebody there subscribes to.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use bus::bounded_queue::Pop;
+use bus::{Bus, BusError, RawMessage};
+use protocol::{CavId, KeyExpr, Kind, Limits, Stream, Topic, wire};
+use ros2::Translator;
+
+use super::publisher::RosPublisher;
+
+/// Period at which subscribers are looked for.
+const POLL_PERIOD: Duration = Duration::from_millis(100);
+
+/// Forwards the sweeps of `cav` until `ending` is set. The run is asked for them only while they have a subscriber:
+/// sweeps are most of the bytes of a run.
+pub(super) fn forward(
+    bus: &Bus,
+    cav: &CavId,
+    publisher: &mut RosPublisher,
+    ending: &Arc<AtomicBool>,
+) -> Result<(), BusError> {
+    let topic = Topic::Stream { cav: cav.clone(), stream: Stream::Lidar };
+    let key = KeyExpr::one(&bus.key(topic.clone()));
+    let mut translator = Translator::new(&bus.identity().run);
+    let is_ending = || ending.load(Ordering::Relaxed);
+    while !is_ending() {
+        if !publisher.is_wanted() {
+            thread::sleep(POLL_PERIOD);
+            continue;
+        }
+        let tap = bus.tap(std::slice::from_ref(&key), 1)?;
+        while publisher.is_wanted() && !is_ending() {
+            let Pop::Item(_, raw) = tap.take(Some(Instant::now() + POLL_PERIOD)) else { continue };
+            for message in translated(&mut translator, &topic, &raw) {
+                publisher.publish(message.cdr)?;
+            }
+        }
+    }
+    Ok(())
+}
+
+fn translated(translator: &mut Translator, topic: &Topic, raw: &RawMessage) -> Vec<ros2::RosMessage> {
+    match wire::decode_any(raw.pieces(), &Limits::DEFAULT) {
+        Ok((header, _)) if header.kind == Kind::Control => Vec::new(),
+        Ok((header, message)) => translator.translate(topic, header.stamp.capture_nanos, &message),
+        Err(error) => {
+            tracing::warn!("{}: left out: {error}", raw.key);
+            Vec::new()
+        }
+    }
+}

@@ -1,0 +1,135 @@
+//! Judgement of the detections of a frame: true and false positives, missed objects, and the average precision so far.
+
+use std::collections::BTreeMap;
+
+use dataset::ground_truth::GroundTruthRule;
+use protocol::{BevGrid, Detections, Truth};
+use serde::Serialize;
+use training::average_precision::{Ordering, Scorer, matches};
+
+use crate::score::true_objects;
+
+/// IoU from which a detection is a true positive.
+const IOU: f64 = 0.5;
+
+/// Rectangle in which an ego detects, in the frame of its LiDAR, metres.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct DetectionArea {
+    /// Lower and upper end of x.
+    pub x_m: [f64; 2],
+    /// The same for y.
+    pub y_m: [f64; 2],
+}
+
+impl From<&BevGrid> for DetectionArea {
+    fn from(grid: &BevGrid) -> Self {
+        let edges = |low_m: f64, cells: u32| [low_m, low_m + f64::from(cells) * grid.cell_m];
+        Self { x_m: edges(grid.x_min_m, grid.width), y_m: edges(grid.y_min_m, grid.height) }
+    }
+}
+
+/// Judgement of one frame.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub(super) struct Judgement {
+    /// For each detection whether it is a true positive.
+    pub(super) hits: Vec<bool>,
+    /// For each object that counts, by id, the score of the detection that found it.
+    pub(super) found: BTreeMap<i64, Option<f32>>,
+}
+
+impl Judgement {
+    /// True and false positives from a score on, and missed objects.
+    pub(super) fn counts(&self, result: &Detections, least_score: f32) -> [usize; 3] {
+        let is_counted = |score: &f32| *score >= least_score;
+        let scores = result.detections.iter().map(|detection| detection.score);
+        let [mut hits, mut false_positives] = [0, 0];
+        for (score, is_hit) in scores.zip(&self.hits).filter(|(score, _)| is_counted(score)) {
+            let _ = score;
+            *(if *is_hit { &mut hits } else { &mut false_positives }) += 1;
+        }
+        let missed = self.found.values().filter(|score| !score.is_some_and(|score| is_counted(&score))).count();
+        [hits, false_positives, missed]
+    }
+}
+
+/// Judge of the frames of a run: objects of OPV2V's protocol within the area count.
+pub(super) struct Judge {
+    scorer: Scorer,
+}
+
+impl Default for Judge {
+    fn default() -> Self {
+        Self { scorer: Scorer::new(&[IOU]) }
+    }
+}
+
+impl Judge {
+    /// Judges a frame and adds it to those before.
+    pub(super) fn judge(&mut self, result: &Detections, truth: &Truth, area: &DetectionArea) -> Judgement {
+        let rule = GroundTruthRule { x_m: area.x_m, y_m: area.y_m, ..GroundTruthRule::OPV2V };
+        let objects = true_objects(truth, &result.ego, &rule);
+        let boxes: Vec<_> = objects.iter().map(|(_, box3d)| *box3d).collect();
+        self.scorer.add(&result.detections, &boxes);
+        let matched = matches(&result.detections, &boxes, IOU);
+        let mut found: BTreeMap<i64, Option<f32>> = objects.iter().map(|(id, _)| (*id, None)).collect();
+        for (detection, object) in result.detections.iter().zip(&matched) {
+            if let Some((id, _)) = object.and_then(|object| objects.get(object)) {
+                found.insert(*id, Some(detection.score));
+            }
+        }
+        Judgement { hits: matched.iter().map(Option::is_some).collect(), found }
+    }
+
+    /// Average precision of the frames so far; `None` without an object.
+    pub(super) fn average_precision(&self) -> Option<f64> {
+        let tally = self.scorer.tallies().first()?;
+        (tally.objects > 0).then(|| tally.curve(Ordering::Global).average_precision)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use protocol::{AgentTruth, Box3d, CavId, Detection, Pose, PoseEstimate, TrueObject};
+
+    use super::*;
+
+    #[test]
+    fn positives_and_missed_objects_are_counted_by_score_within_the_area() {
+        let ego = CavId::new("7").unwrap();
+        let object = |id: i64, x_m: f64| TrueObject {
+            id,
+            class: "car".into(),
+            world_from_object: Pose::from_xyz_yaw([x_m, 0.0, 0.0], 0.0),
+            size_m: [4.0, 2.0, 1.5],
+            speed_mps: None,
+        };
+        let objects = vec![object(1, 10.0), object(2, 20.0), object(3, 80.0)];
+        let agent = AgentTruth { cav: ego.clone(), world_from_lidar: Pose::IDENTITY, objects };
+        let truth = Truth { tick: 0, agents: vec![agent] };
+        let detection = |x_m: f64, score: f32| Detection {
+            box3d: Box3d { center_m: [x_m, 0.0, 0.0], size_m: [4.0, 2.0, 1.5], heading_rad: 0.0 },
+            score,
+            source: None,
+        };
+        let result = Detections {
+            ego,
+            agent_frame: 0,
+            method: "max".into(),
+            pose: PoseEstimate::new(Pose::IDENTITY, 1.0),
+            detections: vec![detection(10.2, 0.9), detection(40.0, 0.6), detection(20.0, 0.3)],
+            fused: vec![],
+            skipped: vec![],
+            neighbours: vec![],
+            stages: vec![],
+        };
+        let grid = BevGrid { x_min_m: -51.2, y_min_m: -38.4, cell_m: 0.8, width: 128, height: 96 };
+        let mut judge = Judge::default();
+        assert_eq!(judge.average_precision(), None);
+        let judgement = judge.judge(&result, &truth, &DetectionArea::from(&grid));
+        assert_eq!(judgement.hits, [true, false, true]);
+        assert_eq!(judgement.found, BTreeMap::from([(1, Some(0.9)), (2, Some(0.3))]));
+        assert_eq!(judgement.counts(&result, 0.2), [2, 1, 0]);
+        assert_eq!(judgement.counts(&result, 0.5), [1, 1, 1]);
+        assert!(judge.average_precision().unwrap() > 0.8);
+    }
+}

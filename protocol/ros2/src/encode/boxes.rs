@@ -1,0 +1,149 @@
+//! Boxes: `vision_msgs/Detection3DArray` for programs, `visualization_msgs/MarkerArray` for viewers.
+
+use protocol::{Box3d, Detection, Pose, TrueObject};
+
+use crate::cdr;
+use crate::cdr::Cdr;
+
+/// `visualization_msgs/Marker::CUBE`.
+const CUBE: i32 = 1;
+/// `visualization_msgs/Marker::ADD` and `DELETEALL`.
+const ADD: i32 = 0;
+const DELETE_ALL: i32 = 3;
+/// The one class of the detectors.
+const CLASS: &str = "vehicle";
+
+/// Detections in the frame `frame_id`. The id of a detection is the vehicle that alone made it, if one did.
+pub(crate) fn detections(nanos: u64, frame_id: &str, detections: &[Detection]) -> Vec<u8> {
+    cdr::message(|cdr| {
+        cdr::header(cdr, nanos, frame_id);
+        cdr.write_sequence_length(detections.len());
+        for Detection { box3d, score, source } in detections {
+            let pose = Pose::from_xyz_yaw(box3d.center_m, box3d.heading_rad);
+            cdr::header(cdr, nanos, frame_id);
+            cdr.write_sequence_length(1);
+            cdr.write_string(CLASS);
+            cdr.write_f64(f64::from(*score));
+            cdr::pose(cdr, &pose);
+            // Not known: zeros, as other detectors write.
+            cdr::covariance(cdr, &[[0.0; 6]; 6]);
+            cdr::pose(cdr, &pose);
+            cdr::xyz(cdr, box3d.size_m);
+            cdr.write_string(source.as_ref().map_or("", protocol::CavId::as_str));
+        }
+    })
+}
+
+/// A box with its marker's properties.
+pub(crate) struct Marked {
+    /// Id; `None`: its index in the list.
+    pub(crate) id: Option<i32>,
+    pub(crate) box3d: Box3d,
+    pub(crate) alpha: f32,
+    /// Class or score: viewers show it on selection.
+    pub(crate) text: String,
+}
+
+impl From<&Detection> for Marked {
+    fn from(detection: &Detection) -> Self {
+        Self {
+            id: None,
+            box3d: detection.box3d,
+            alpha: 0.25 + 0.6 * detection.score,
+            text: detection.score.to_string(),
+        }
+    }
+}
+
+/// An object of the ground truth.
+pub(crate) fn truth_marker(object: &TrueObject) -> Marked {
+    Marked {
+        id: Some(marker_id(object.id)),
+        box3d: Box3d {
+            center_m: object.world_from_object.translation_m,
+            size_m: object.size_m,
+            heading_rad: object.world_from_object.yaw_rad(),
+        },
+        alpha: 0.35,
+        text: object.class.clone(),
+    }
+}
+
+/// ROS has 32 bits for it; larger ids are truncated, which affects viewers only.
+#[expect(clippy::cast_possible_truncation, reason = "wanted")]
+fn marker_id(id: i64) -> i32 {
+    id as i32
+}
+
+/// All boxes of a capture time: the first marker deletes those of the previous one.
+pub(crate) fn markers(nanos: u64, frame_id: &str, ns: &str, rgb: [f32; 3], boxes: &[Marked]) -> Vec<u8> {
+    let nothing = Box3d { center_m: [0.0; 3], size_m: [0.0; 3], heading_rad: 0.0 };
+    let sweep = Marked { id: Some(0), box3d: nothing, alpha: 0.0, text: String::new() };
+    cdr::message(|cdr| {
+        cdr.write_sequence_length(boxes.len() + 1);
+        marker(cdr, (frame_id, ns, nanos), (0, DELETE_ALL), rgb, &sweep);
+        for (place, marked) in (0..).zip(boxes) {
+            marker(cdr, (frame_id, ns, nanos), (marked.id.unwrap_or(place), ADD), rgb, marked);
+        }
+    })
+}
+
+fn marker(
+    cdr: &mut Cdr<'_>,
+    (frame_id, ns, nanos): (&str, &str, u64),
+    (id, action): (i32, i32),
+    rgb: [f32; 3],
+    marked: &Marked,
+) {
+    let Marked { id: _, box3d, alpha, text } = marked;
+    cdr::header(cdr, nanos, frame_id);
+    cdr.write_string(ns);
+    cdr.write_i32(id);
+    cdr.write_i32(CUBE);
+    cdr.write_i32(action);
+    cdr::pose(cdr, &Pose::from_xyz_yaw(box3d.center_m, box3d.heading_rad));
+    cdr::xyz(cdr, box3d.size_m);
+    rgb.into_iter().chain([*alpha]).for_each(|value| cdr.write_f32(value));
+    // Lifetime: until it is deleted.
+    cdr.write_i32(0);
+    cdr.write_u32(0);
+    cdr.write_bool(false);
+    cdr.write_sequence_length(0); // points
+    cdr.write_sequence_length(0); // colours
+    cdr.write_string(""); // texture
+    cdr::header(cdr, 0, "");
+    cdr.write_string("");
+    cdr.write_sequence_length(0);
+    cdr.write_sequence_length(0); // coordinates in it
+    cdr.write_string(text);
+    cdr.write_string(""); // mesh
+    cdr.write_string("");
+    cdr.write_sequence_length(0);
+    cdr.write_bool(false);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_detection_is_laid_out_as_vision_msgs_lays_it_out() {
+        let box3d = Box3d { center_m: [1.0, 2.0, 3.0], size_m: [4.0, 5.0, 6.0], heading_rad: 0.0 };
+        let cdr = detections(7_000_000_008, "f", &[Detection { box3d, score: 0.5, source: None }]);
+        let f64s = |values: &[f64]| values.iter().flat_map(|value| value.to_le_bytes()).collect::<Vec<u8>>();
+        let header = b"\x07\0\0\0\x08\0\0\0\x02\0\0\0f\0";
+        let mut expected = vec![0, 1, 0, 0];
+        expected.extend(header);
+        expected.extend([0, 0, 1, 0, 0, 0]);
+        expected.extend(header);
+        expected.extend([0, 0, 1, 0, 0, 0]);
+        expected.extend(b"\x08\0\0\0vehicle\0");
+        // Aligned to 8, counted from the end of the encapsulation header.
+        expected.extend([0; 4]);
+        expected.extend(f64s(&[0.5, 1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0]));
+        expected.extend([0; 36 * 8]);
+        expected.extend(f64s(&[1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0, 4.0, 5.0, 6.0]));
+        expected.extend(b"\x01\0\0\0\0");
+        assert_eq!(cdr, expected);
+    }
+}

@@ -1,0 +1,231 @@
+//! Endpoints of rmw_zenoh: keys of topics, liveliness tokens of nodes and their endpoints, attachments of messages.
+//!
+//! Source: the design document and sources of `ros2/rmw_zenoh`, releases for Jazzy.
+
+use twox_hash::XxHash3_128;
+
+use super::names::RosName;
+use super::qos::Qos;
+use super::ros_type::RosType;
+use super::type_hash::Distribution;
+
+/// Root of liveliness tokens.
+pub const TOKEN_ROOT: &str = "@ros2_lv";
+/// Length of an attachment, bytes.
+pub const ATTACHMENT_LEN: usize = 33;
+/// Global identifier of an endpoint, 16 bytes.
+pub type Gid = [u8; 16];
+
+/// Kind of an endpoint.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum EndpointKind {
+    /// Publisher of a topic.
+    Publisher,
+    /// Subscription to a topic.
+    Subscription,
+}
+
+/// A node of ROS 2 on a session of zenoh.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Node {
+    /// `ROS_DOMAIN_ID`.
+    pub domain_id: u32,
+    /// Id of the session: hexadecimal digits.
+    pub zid: String,
+    /// Namespace; `None`: the root.
+    pub namespace: Option<RosName>,
+    /// Name, without a slash.
+    pub name: String,
+    /// Distribution of the other nodes.
+    pub distribution: Distribution,
+}
+
+/// One publisher or subscription of a [`Node`].
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Endpoint {
+    /// Number of the endpoint in its session; the node is number 0.
+    pub id: u32,
+    /// Publisher or subscription.
+    pub kind: EndpointKind,
+    /// Its topic.
+    pub topic: RosName,
+    /// Type of the messages.
+    pub ros_type: RosType,
+    /// Quality of service that it offers or requests.
+    pub qos: Qos,
+}
+
+impl Node {
+    /// Liveliness token of the node.
+    #[must_use]
+    pub fn token(&self) -> String {
+        format!("{TOKEN_ROOT}/{}/{}/0/0/NN/{}", self.domain_id, self.zid, self.identity())
+    }
+
+    /// Liveliness token of one of its endpoints.
+    #[must_use]
+    pub fn endpoint_token(&self, endpoint: &Endpoint) -> String {
+        let Endpoint { id, kind, topic, ros_type, qos } = endpoint;
+        let kind = match kind {
+            EndpointKind::Publisher => "MP",
+            EndpointKind::Subscription => "MS",
+        };
+        let (topic, name, hash) = (mangled(topic.as_str()), ros_type.dds_name(), ros_type.hash(self.distribution));
+        let identity = self.identity();
+        format!("{TOKEN_ROOT}/{}/{}/0/{id}/{kind}/{identity}/{topic}/{name}/{hash}/{qos}", self.domain_id, self.zid)
+    }
+
+    /// Key on which messages of a topic are published.
+    #[must_use]
+    pub fn key(&self, topic: &RosName, ros_type: RosType) -> String {
+        format!("{}/{}", self.keys_of_any_hash(topic, ros_type), ros_type.hash(self.distribution))
+    }
+
+    /// Key expression of a topic's messages, whatever the hash: publishers of every distribution match.
+    #[must_use]
+    pub fn any_hash(&self, topic: &RosName, ros_type: RosType) -> String {
+        format!("{}/*", self.keys_of_any_hash(topic, ros_type))
+    }
+
+    fn keys_of_any_hash(&self, topic: &RosName, ros_type: RosType) -> String {
+        // A topic begins with its slash.
+        format!("{}{topic}/{}", self.domain_id, ros_type.dds_name())
+    }
+
+    /// Enclave, namespace and name in tokens.
+    fn identity(&self) -> String {
+        let namespace = self.namespace.as_ref().map_or("/", RosName::as_str);
+        format!("%/{}/{}", mangled(namespace), mangled(&self.name))
+    }
+}
+
+/// A name in a token: `/` becomes `%`.
+fn mangled(name: &str) -> String {
+    name.replace('/', "%")
+}
+
+/// Identifier of an endpoint: the hash of its token.
+#[must_use]
+pub fn gid(token: &str) -> Gid {
+    // Low half first, both little-endian: the whole in little-endian.
+    XxHash3_128::oneshot(token.as_bytes()).to_le_bytes()
+}
+
+/// Attachment of a message: the sequence number of its publisher, the time of publication and its publisher.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Attachment {
+    /// Sequence number, from 1.
+    pub sequence: i64,
+    /// Time of publication, nanoseconds on the Unix clock.
+    pub source_nanos: i64,
+    /// The publisher.
+    pub gid: Gid,
+}
+
+impl Attachment {
+    /// The bytes on the wire.
+    #[must_use]
+    pub fn to_bytes(&self) -> [u8; ATTACHMENT_LEN] {
+        let Self { sequence, source_nanos, gid } = self;
+        let mut bytes = [0; ATTACHMENT_LEN];
+        let parts = [&sequence.to_le_bytes()[..], &source_nanos.to_le_bytes(), &[16], gid];
+        for (place, byte) in bytes.iter_mut().zip(parts.into_iter().flatten()) {
+            *place = *byte;
+        }
+        bytes
+    }
+
+    /// Reads the bytes of an attachment; `None` if they have another length or layout.
+    #[must_use]
+    pub fn from_bytes(bytes: &[u8]) -> Option<Self> {
+        let (sequence, rest) = bytes.split_first_chunk()?;
+        let (source_nanos, rest) = rest.split_first_chunk()?;
+        let (16, gid) = rest.split_first()? else { return None };
+        Some(Self {
+            sequence: i64::from_le_bytes(*sequence),
+            source_nanos: i64::from_le_bytes(*source_nanos),
+            gid: gid.try_into().ok()?,
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn name(text: &str) -> RosName {
+        RosName::new(text).unwrap()
+    }
+
+    fn node(namespace: Option<&str>) -> Node {
+        Node {
+            domain_id: 7,
+            zid: "a1b2".into(),
+            namespace: namespace.map(name),
+            name: "v2vloc".into(),
+            distribution: Distribution::Jazzy,
+        }
+    }
+
+    fn points() -> Endpoint {
+        Endpoint {
+            id: 3,
+            kind: EndpointKind::Publisher,
+            topic: name("/cav_1/points"),
+            ros_type: RosType::PointCloud2,
+            qos: Qos::SENSOR_DATA,
+        }
+    }
+
+    const HASH: &str = "RIHS01_9198cabf7da3796ae6fe19c4cb3bdd3525492988c70522628af5daa124bae2b5";
+
+    #[test]
+    fn keys_and_tokens_are_those_of_rmw_zenoh() {
+        let (root, fleet) = (node(None), node(Some("/fleet/a")));
+        assert_eq!(root.token(), "@ros2_lv/7/a1b2/0/0/NN/%/%/v2vloc");
+        assert_eq!(fleet.token(), "@ros2_lv/7/a1b2/0/0/NN/%/%fleet%a/v2vloc");
+        assert_eq!(
+            fleet.endpoint_token(&points()),
+            format!(
+                "@ros2_lv/7/a1b2/0/3/MP/%/%fleet%a/v2vloc/%cav_1%points/sensor_msgs::msg::dds_::PointCloud2_/{HASH}/2::,5:,:,:,,"
+            )
+        );
+        let key = "7/cav_1/points/sensor_msgs::msg::dds_::PointCloud2_";
+        assert_eq!(root.key(&points().topic, RosType::PointCloud2), format!("{key}/{HASH}"));
+        assert_eq!(root.any_hash(&points().topic, RosType::PointCloud2), format!("{key}/*"));
+        let humble = Node { distribution: Distribution::Humble, ..root };
+        assert_eq!(humble.key(&points().topic, RosType::PointCloud2), format!("{key}/TypeHashNotSupported"));
+    }
+
+    #[test]
+    fn a_gid_is_the_hash_of_the_token() {
+        // XXH3-128 of no bytes, seed 0, in xxHash's own test vectors: 99aa06d3014798d8 6001c324468d497f.
+        let empty = [0x7f, 0x49, 0x8d, 0x46, 0x24, 0xc3, 0x01, 0x60, 0xd8, 0x98, 0x47, 0x01, 0xd3, 0x06, 0xaa, 0x99];
+        assert_eq!(gid(""), empty);
+        assert_ne!(gid(&node(None).endpoint_token(&points())), gid(&node(None).token()));
+    }
+
+    #[test]
+    fn an_attachment_is_laid_out_as_rmw_zenoh_lays_it_out() {
+        let attachment = Attachment { sequence: 1, source_nanos: 0x0102_0304, gid: *b"0123456789abcdef" };
+        let bytes = attachment.to_bytes();
+        assert_eq!(bytes[..], b"\x01\0\0\0\0\0\0\0\x04\x03\x02\x01\0\0\0\0\x100123456789abcdef"[..]);
+        assert_eq!(Attachment::from_bytes(&bytes), Some(attachment));
+        let other_length = [bytes.as_slice(), &[0]].concat();
+        let mut other_layout = bytes;
+        other_layout[16] = 15;
+        for bytes in [&bytes[..32], &other_length, &other_layout, &[]] {
+            assert_eq!(Attachment::from_bytes(bytes), None);
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn any_attachment_is_read_back(sequence: i64, source_nanos: i64, gid: Gid) {
+            let attachment = Attachment { sequence, source_nanos, gid };
+            prop_assert_eq!(Attachment::from_bytes(&attachment.to_bytes()), Some(attachment));
+        }
+    }
+}

@@ -1,0 +1,146 @@
+//! ROS names: topics, frames and namespaces that ROS 2 accepts, and those of a vehicle.
+
+use std::fmt;
+use std::str::FromStr;
+
+use protocol::CavId;
+
+/// Longest topic name that ROS 2 accepts, bytes.
+const MAX_BYTES: usize = 247;
+
+/// Frame of the world.
+pub const MAP_FRAME: &str = "map";
+
+/// Error of a text that is no absolute ROS 2 name.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error(
+    "{text:?} is no ROS 2 name: at most {MAX_BYTES} bytes, '/' before each part, each part of a-z, A-Z, 0-9 and '_', not \
+     beginning with a digit"
+)]
+pub struct NameError {
+    /// Beginning of the text.
+    text: String,
+}
+
+/// An absolute name of ROS 2, for example `/velodyne/points`; a topic or a namespace.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct RosName(Box<str>);
+
+impl RosName {
+    /// Checks `text` by the rules of ROS 2 for absolute topic names.
+    ///
+    /// # Errors
+    /// [`NameError`] states the text that is no name.
+    pub fn new(text: &str) -> Result<Self, NameError> {
+        let is_token = |token: &str| {
+            token.bytes().all(|byte| byte.is_ascii_alphanumeric() || byte == b'_')
+                && token.bytes().next().is_some_and(|first| !first.is_ascii_digit())
+        };
+        match text.strip_prefix('/') {
+            Some(tokens) if text.len() <= MAX_BYTES && tokens.split('/').all(is_token) => Ok(Self(text.into())),
+            _ => Err(NameError { text: text.chars().take(MAX_BYTES).collect() }),
+        }
+    }
+
+    /// A name that is made of valid parts.
+    pub(crate) fn known(text: &str) -> Self {
+        Self(text.into())
+    }
+
+    /// The name, with its leading slash.
+    #[must_use]
+    pub fn as_str(&self) -> &str {
+        &self.0
+    }
+}
+
+impl fmt::Display for RosName {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.0)
+    }
+}
+
+impl FromStr for RosName {
+    type Err = NameError;
+
+    fn from_str(text: &str) -> Result<Self, NameError> {
+        Self::new(text)
+    }
+}
+
+/// Name of a vehicle in topics and frames: `cav_1000`. A part of a ROS name begins with no digit, has no hyphen and no
+/// two underscores in a row: `-` becomes `M` (`-1` is `cav_M1`), an underscore after another one `U`. Ids have no
+/// capitals, so different vehicles have different names.
+#[must_use]
+pub fn vehicle(cav: &CavId) -> String {
+    let mut name = String::from("cav_");
+    for letter in cav.as_str().chars() {
+        name.push(match letter {
+            '-' => 'M',
+            '_' if name.ends_with('_') => 'U',
+            other => other,
+        });
+    }
+    name
+}
+
+/// Frame of a vehicle's LiDAR, at its estimated pose.
+#[must_use]
+pub fn lidar_frame(cav: &CavId) -> String {
+    format!("{}/lidar", vehicle(cav))
+}
+
+/// Frame of a vehicle's body, fixed to its LiDAR.
+#[must_use]
+pub fn base_frame(cav: &CavId) -> String {
+    format!("{}/base_link", vehicle(cav))
+}
+
+/// Frame of a vehicle's LiDAR at its true pose.
+#[must_use]
+pub fn truth_frame(cav: &CavId) -> String {
+    format!("{}/truth", vehicle(cav))
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn vehicle_of(id: &str) -> String {
+        vehicle(&CavId::new(id).unwrap())
+    }
+
+    #[test]
+    fn vehicles_have_names_that_ros_accepts() {
+        assert_eq!(vehicle_of("1000"), "cav_1000");
+        assert_eq!(vehicle_of("-1"), "cav_M1");
+        assert_eq!(vehicle_of("_a__b"), "cav_Ua_Ub");
+    }
+
+    #[test]
+    fn names_are_checked_as_ros_does() {
+        for text in ["/points", "/cav_1000/points", "/a/b/c", "/_x"] {
+            assert_eq!(RosName::new(text).unwrap().as_str(), text);
+        }
+        let long = format!("/{}", "a".repeat(MAX_BYTES));
+        for text in ["", "/", "points", "/1000/points", "/a//b", "/a/", "/a-b", "/a*", "/a%b", "/@a", "~/a", &long] {
+            let error = RosName::new(text).unwrap_err().to_string();
+            assert!(error.len() < 600 && error.contains("ROS 2 name"), "{error}");
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn different_vehicles_have_different_valid_names(ids in prop::array::uniform2("[a-z0-9_-]{1,6}")) {
+            let [first, second] = ids.each_ref().map(|id| CavId::new(id));
+            prop_assume!(first.is_ok() && second.is_ok());
+            let names = ids.each_ref().map(|id| vehicle_of(id));
+            for name in &names {
+                prop_assert!(RosName::new(&format!("/{name}/points")).is_ok() && !name.contains("__"), "{}", name);
+            }
+            prop_assert_eq!(ids[0] == ids[1], names[0] == names[1]);
+        }
+    }
+}

@@ -1,0 +1,381 @@
+//! Reader of `sensor_msgs/PointCloud2`: sweeps as the drivers of LiDARs publish them.
+//!
+//! Read are `x`, `y`, `z` of 32 or 64 bits and `intensity` of any type, in any order, at any offset, of either byte order,
+//! with padding after points and rows, in one row or in many (organised). Points without coordinates, as organised clouds
+//! have them for rays without a return, are left out.
+
+use protocol::PointCloud;
+use re_cdr::{BigEndian, ByteOrder, CdrReader, LittleEndian};
+
+/// More fields than any driver publishes.
+const MAX_FIELDS: u32 = 256;
+
+/// A sweep of a LiDAR.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Sweep {
+    /// Capture time: stamp of the header, nanoseconds.
+    pub capture_nanos: u64,
+    /// Frame of the points, as the driver names it.
+    pub frame_id: String,
+    /// Points in the frame of the LiDAR, metres; intensity as published, 0 where there is none.
+    pub points: PointCloud,
+    /// Points without coordinates (NaN or infinite), which are left out.
+    pub without_return: usize,
+    /// Points that are farther away than the limit, which are left out.
+    pub too_far: usize,
+}
+
+/// Error of a message that is no point cloud, or one that cannot be read.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum PointCloudError {
+    /// The encapsulation header names another encoding.
+    #[error("encoding {found:?}, not 00 00 or 00 01 (CDR)")]
+    Encoding {
+        /// First bytes of the message.
+        found: Vec<u8>,
+    },
+    /// The message ends early, or a text or flag in it is malformed.
+    #[error("{field} at byte {at} of {len}: {cause}")]
+    Cdr {
+        /// Field that is read.
+        field: &'static str,
+        /// Position, bytes after the encapsulation header.
+        at: usize,
+        /// Length of the message.
+        len: usize,
+        /// Error of the decoder.
+        cause: String,
+    },
+    /// The capture time is before 1970 or has more than 10^9 nanoseconds.
+    #[error("header.stamp is {sec} s and {nanosec} ns, not a time from 1970 on")]
+    Stamp {
+        /// Seconds.
+        sec: i32,
+        /// Nanoseconds.
+        nanosec: u32,
+    },
+    /// A coordinate is missing.
+    #[error("no field {missing:?} among {found:?}")]
+    NoField {
+        /// The missing field.
+        missing: &'static str,
+        /// Names of the fields there are.
+        found: Vec<String>,
+    },
+    /// A field has another type than it can have.
+    #[error("field {name:?} has datatype {datatype} and count {count}, not {allowed}")]
+    FieldType {
+        /// Name of the field.
+        name: &'static str,
+        /// Its datatype, `sensor_msgs/PointField`.
+        datatype: u8,
+        /// Its number of values.
+        count: u32,
+        /// Datatypes that can be read.
+        allowed: &'static str,
+    },
+    /// A number of the layout contradicts another one.
+    #[error("{what} is {found}, not at least {needed} ({why})")]
+    Layout {
+        /// Name of the number.
+        what: &'static str,
+        /// Its value.
+        found: u64,
+        /// Least value that fits.
+        needed: u64,
+        /// What it has to hold.
+        why: &'static str,
+    },
+    /// More points or fields than are accepted.
+    #[error("{what}: {found}, at most {max} are accepted")]
+    TooMany {
+        /// What there is too much of.
+        what: &'static str,
+        /// Number in the message.
+        found: u64,
+        /// Largest number accepted.
+        max: u64,
+    },
+}
+
+/// Limits of a reader.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SweepLimits {
+    /// Points of a sweep, those without return included.
+    pub max_points: u64,
+    /// Largest absolute coordinate and intensity.
+    pub max_abs_value: f32,
+}
+
+/// Reads a `sensor_msgs/PointCloud2` in CDR, with its encapsulation header. No more memory is allocated than the message
+/// has bytes for.
+///
+/// # Errors
+/// [`PointCloudError`] names the field and both values.
+pub fn read_point_cloud(bytes: &[u8], limits: SweepLimits) -> Result<Sweep, PointCloudError> {
+    match bytes.split_first_chunk() {
+        Some(([0, 0, _, _], body)) => Reader::<BigEndian>::new(body).sweep(limits),
+        Some(([0, 1, _, _], body)) => Reader::<LittleEndian>::new(body).sweep(limits),
+        _ => Err(PointCloudError::Encoding { found: bytes.iter().take(4).copied().collect() }),
+    }
+}
+
+/// Datatypes of `sensor_msgs/PointField`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Datatype {
+    Int8 = 1,
+    Uint8,
+    Int16,
+    Uint16,
+    Int32,
+    Uint32,
+    Float32,
+    Float64,
+}
+
+impl Datatype {
+    const ALL: [Self; 8] =
+        [Self::Int8, Self::Uint8, Self::Int16, Self::Uint16, Self::Int32, Self::Uint32, Self::Float32, Self::Float64];
+
+    fn of(number: u8) -> Option<Self> {
+        Self::ALL.into_iter().find(|datatype| *datatype as u8 == number)
+    }
+
+    /// Bytes of a value.
+    fn size(self) -> u32 {
+        match self {
+            Self::Int8 | Self::Uint8 => 1,
+            Self::Int16 | Self::Uint16 => 2,
+            Self::Int32 | Self::Uint32 | Self::Float32 => 4,
+            Self::Float64 => 8,
+        }
+    }
+
+    /// The value at the beginning of `bytes`; `None` if there are too few.
+    fn read<BO: ByteOrder>(self, bytes: &[u8]) -> Option<f64> {
+        let value = bytes.get(..self.size() as usize)?;
+        Some(match self {
+            Self::Int8 => f64::from(value.first()?.cast_signed()),
+            Self::Uint8 => f64::from(*value.first()?),
+            Self::Int16 => BO::read_i16(value).into(),
+            Self::Uint16 => BO::read_u16(value).into(),
+            Self::Int32 => BO::read_i32(value).into(),
+            Self::Uint32 => BO::read_u32(value).into(),
+            Self::Float32 => BO::read_f32(value).into(),
+            Self::Float64 => BO::read_f64(value),
+        })
+    }
+}
+
+/// A field of a point, as the message describes it.
+struct Field<'a> {
+    name: &'a str,
+    offset: u32,
+    datatype: u8,
+    count: u32,
+}
+
+/// A field that is read: its place in a point and its type.
+#[derive(Debug, Clone, Copy)]
+struct Column {
+    offset: u32,
+    datatype: Datatype,
+}
+
+impl Column {
+    fn end(self) -> u64 {
+        u64::from(self.offset) + u64::from(self.datatype.size())
+    }
+
+    fn value<BO: ByteOrder>(self, point: &[u8]) -> Option<f64> {
+        self.datatype.read::<BO>(point.get(self.offset as usize..)?)
+    }
+}
+
+/// Fields of a point that are read.
+struct Columns {
+    xyz: [Column; 3],
+    intensity: Option<Column>,
+}
+
+impl Columns {
+    fn find(fields: &[Field<'_>]) -> Result<Self, PointCloudError> {
+        let floats = |datatype| matches!(datatype, Datatype::Float32 | Datatype::Float64);
+        let coordinate = |name| {
+            let found = || fields.iter().map(|field| field.name.chars().take(40).collect()).collect();
+            column(fields, name, "datatype 7 or 8 (FLOAT32, FLOAT64) and count 1", floats)?
+                .ok_or_else(|| PointCloudError::NoField { missing: name, found: found() })
+        };
+        Ok(Self {
+            xyz: [coordinate("x")?, coordinate("y")?, coordinate("z")?],
+            intensity: column(fields, "intensity", "datatype 1 to 8 and count 1", |_| true)?,
+        })
+    }
+
+    fn end(&self) -> u64 {
+        self.xyz.iter().chain(&self.intensity).map(|column| column.end()).max().unwrap_or(0)
+    }
+}
+
+/// The field `name`, if there is one.
+fn column(
+    fields: &[Field<'_>],
+    name: &'static str,
+    allowed: &'static str,
+    is_allowed: impl Fn(Datatype) -> bool,
+) -> Result<Option<Column>, PointCloudError> {
+    let Some(&Field { offset, datatype, count, .. }) = fields.iter().find(|field| field.name == name) else {
+        return Ok(None);
+    };
+    match Datatype::of(datatype).filter(|datatype| is_allowed(*datatype)) {
+        // Some drivers leave the count at 0.
+        Some(datatype) if count <= 1 => Ok(Some(Column { offset, datatype })),
+        _ => Err(PointCloudError::FieldType { name, datatype, count, allowed }),
+    }
+}
+
+/// Sizes of a cloud.
+struct Layout {
+    height: u32,
+    width: u32,
+    point_step: u32,
+    row_step: u32,
+}
+
+impl Layout {
+    /// Bytes from one row to the next.
+    fn stride(&self) -> u64 {
+        let row = u64::from(self.width) * u64::from(self.point_step);
+        // The only row of a cloud needs no step, and some drivers give none.
+        if self.height > 1 { u64::from(self.row_step) } else { row }
+    }
+
+    fn check(&self, columns: &Columns, data_len: usize, limits: SweepLimits) -> Result<(), PointCloudError> {
+        let at_least = |what, found, needed, why| {
+            if found >= needed { Ok(()) } else { Err(PointCloudError::Layout { what, found, needed, why }) }
+        };
+        let points = u64::from(self.height) * u64::from(self.width);
+        if points > limits.max_points {
+            return Err(PointCloudError::TooMany { what: "height x width", found: points, max: limits.max_points });
+        }
+        at_least("point_step", self.point_step.into(), columns.end(), "end of the last field")?;
+        let row = u64::from(self.width) * u64::from(self.point_step);
+        at_least("row_step", self.stride(), row, "width x point_step")?;
+        let rows = u64::from(self.height.saturating_sub(1));
+        let needed = if self.height == 0 { 0 } else { rows.saturating_mul(self.stride()).saturating_add(row) };
+        at_least("length of data", data_len as u64, needed, "rows x row_step")
+    }
+}
+
+/// Reader of one message in byte order `BO`.
+struct Reader<'a, BO> {
+    cdr: CdrReader<'a, BO>,
+    len: usize,
+}
+
+impl<'a, BO: ByteOrder> Reader<'a, BO> {
+    fn new(body: &'a [u8]) -> Self {
+        Self { cdr: CdrReader::new(body), len: body.len() }
+    }
+
+    fn read<T>(
+        &mut self,
+        field: &'static str,
+        read: impl FnOnce(&mut CdrReader<'a, BO>) -> re_cdr::Result<T>,
+    ) -> Result<T, PointCloudError> {
+        let at = self.cdr.position();
+        let len = self.len;
+        read(&mut self.cdr).map_err(|cause| PointCloudError::Cdr { field, at, len, cause: cause.to_string() })
+    }
+
+    fn u32(&mut self, field: &'static str) -> Result<u32, PointCloudError> {
+        self.read(field, CdrReader::read_u32)
+    }
+
+    fn sweep(mut self, limits: SweepLimits) -> Result<Sweep, PointCloudError> {
+        let sec = self.read("header.stamp.sec", CdrReader::read_i32)?;
+        let nanosec = self.u32("header.stamp.nanosec")?;
+        let seconds = u64::try_from(sec).ok().filter(|_| nanosec < 1_000_000_000);
+        let seconds = seconds.ok_or(PointCloudError::Stamp { sec, nanosec })?;
+        let frame_id = self.read("header.frame_id", CdrReader::read_str)?;
+        let (height, width) = (self.u32("height")?, self.u32("width")?);
+        let fields = self.fields()?;
+        // Values are in the order that the flag states, whatever the order of the message.
+        let is_big_endian = self.read("is_bigendian", CdrReader::read_u8)? != 0;
+        let (point_step, row_step) = (self.u32("point_step")?, self.u32("row_step")?);
+        let data = self.read("data", CdrReader::read_byte_sequence)?;
+        let columns = Columns::find(&fields)?;
+        let layout = Layout { height, width, point_step, row_step };
+        layout.check(&columns, data.len(), limits)?;
+        let mut sweep = Sweep {
+            capture_nanos: seconds * 1_000_000_000 + u64::from(nanosec),
+            frame_id: frame_id.into(),
+            points: PointCloud::default(),
+            without_return: 0,
+            too_far: 0,
+        };
+        if is_big_endian {
+            sweep.fill::<BigEndian>(data, &layout, &columns, limits.max_abs_value);
+        } else {
+            sweep.fill::<LittleEndian>(data, &layout, &columns, limits.max_abs_value);
+        }
+        Ok(sweep)
+    }
+
+    fn fields(&mut self) -> Result<Vec<Field<'a>>, PointCloudError> {
+        let count = self.u32("length of fields")?;
+        if count > MAX_FIELDS {
+            return Err(PointCloudError::TooMany { what: "fields", found: count.into(), max: MAX_FIELDS.into() });
+        }
+        let field = |_| {
+            Ok(Field {
+                name: self.read("fields.name", CdrReader::read_str)?,
+                offset: self.u32("fields.offset")?,
+                datatype: self.read("fields.datatype", CdrReader::read_u8)?,
+                count: self.u32("fields.count")?,
+            })
+        };
+        (0..count).map(field).collect()
+    }
+}
+
+impl Sweep {
+    /// Adds the points of `data`, whose layout was checked.
+    fn fill<BO: ByteOrder>(&mut self, data: &[u8], layout: &Layout, columns: &Columns, max_abs_value: f32) {
+        let (stride, step) = (layout.stride(), layout.point_step as usize);
+        // Rows of no points may be as many as they like.
+        let rows = if layout.width == 0 { 0 } else { u64::from(layout.height) };
+        for row in 0..rows {
+            let begin = usize::try_from(row * stride).unwrap_or(usize::MAX);
+            let row = data.get(begin..).unwrap_or_default();
+            // A step of 0 was refused: it ends before the last field.
+            for point in row.chunks(step.max(1)).take(layout.width as usize) {
+                self.add::<BO>(point, columns, max_abs_value);
+            }
+        }
+    }
+
+    fn add<BO: ByteOrder>(&mut self, point: &[u8], columns: &Columns, max_abs_value: f32) {
+        let xyz = columns.xyz.map(|column| column.value::<BO>(point).unwrap_or(f64::NAN));
+        let limit = f64::from(max_abs_value);
+        if !xyz.iter().all(|value| value.is_finite()) {
+            self.without_return += 1;
+        } else if xyz.iter().any(|value| value.abs() > limit) {
+            self.too_far += 1;
+        } else {
+            let intensity = columns.intensity.and_then(|column| column.value::<BO>(point));
+            let intensity = intensity.filter(|value| value.is_finite()).unwrap_or(0.0).clamp(-limit, limit);
+            let [x, y, z] = xyz;
+            self.points.xyzi.push([x, y, z, intensity].map(single));
+        }
+    }
+}
+
+/// The nearest value in single precision.
+#[expect(clippy::cast_possible_truncation, reason = "within the limit, rounded")]
+fn single(value: f64) -> f32 {
+    value as f32
+}
+
+#[cfg(test)]
+mod tests;

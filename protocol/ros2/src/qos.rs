@@ -1,0 +1,81 @@
+//! Quality of service of ROS 2 topics: in liveliness tokens and in bags.
+
+use std::fmt;
+
+/// Depth that rmw_zenoh leaves out of a token.
+const DEFAULT_DEPTH: u32 = 42;
+
+/// Quality of service of a publisher or subscription; its history is always keep-last.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Qos {
+    /// True: reliable; false: best effort.
+    pub is_reliable: bool,
+    /// True: transient local (latched): late subscribers get the last messages. False: volatile.
+    pub is_latched: bool,
+    /// Messages that are kept.
+    pub depth: u32,
+}
+
+impl Qos {
+    /// ROS's default profile: reliable, ten messages.
+    pub const DEFAULT: Self = Self { is_reliable: true, is_latched: false, depth: 10 };
+    /// ROS's profile for sensor data: best effort, five messages.
+    pub const SENSOR_DATA: Self = Self { is_reliable: false, is_latched: false, depth: 5 };
+    /// ROS's profile for `/clock`: best effort, one message.
+    pub const CLOCK: Self = Self { is_reliable: false, is_latched: false, depth: 1 };
+    /// tf2's profile for `/tf`.
+    pub const TF: Self = Self { is_reliable: true, is_latched: false, depth: 100 };
+    /// tf2's profile for `/tf_static`.
+    pub const TF_STATIC: Self = Self { is_reliable: true, is_latched: true, depth: 1 };
+
+    /// As `offered_qos_profiles` of a channel, in the numbers that rosbag2 of every distribution reads.
+    #[must_use]
+    pub fn offered_profiles(self) -> String {
+        let (reliability, durability) = self.policies();
+        let forever = "    sec: 9223372036\n    nsec: 854775807\n";
+        format!(
+            "- history: 1\n  depth: {depth}\n  reliability: {reliability}\n  durability: {durability}\n  deadline:\n{forever}  \
+             lifespan:\n{forever}  liveliness: 1\n  liveliness_lease_duration:\n{forever}  \
+             avoid_ros_namespace_conventions: false\n",
+            depth = self.depth
+        )
+    }
+
+    /// Reliability and durability in the numbers of `rmw/types.h`.
+    fn policies(self) -> (u8, u8) {
+        (if self.is_reliable { 1 } else { 2 }, if self.is_latched { 1 } else { 2 })
+    }
+}
+
+/// As in a liveliness token: `reliability:durability:history,depth:deadline:lifespan:liveliness`, values that are
+/// rmw_zenoh's defaults left out.
+impl fmt::Display for Qos {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let shown = |value: u32, default| if value == default { String::new() } else { value.to_string() };
+        let (reliability, durability) = self.policies();
+        let (reliability, durability) = (shown(reliability.into(), 1), shown(durability.into(), 2));
+        write!(f, "{reliability}:{durability}:,{}:,:,:,,", shown(self.depth, DEFAULT_DEPTH))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn tokens_leave_out_what_is_the_default() {
+        let texts = [Qos::DEFAULT, Qos::SENSOR_DATA, Qos::CLOCK, Qos::TF_STATIC].map(|qos| qos.to_string());
+        assert_eq!(texts, ["::,10:,:,:,,", "2::,5:,:,:,,", "2::,1:,:,:,,", ":1:,1:,:,:,,"]);
+        assert_eq!(Qos { depth: 42, ..Qos::DEFAULT }.to_string(), "::,:,:,:,,");
+    }
+
+    #[test]
+    fn bags_get_numbers() {
+        let text = Qos::TF_STATIC.offered_profiles();
+        assert!(
+            text.starts_with("- history: 1\n  depth: 1\n  reliability: 1\n  durability: 1\n  deadline:\n    sec: ")
+        );
+        assert!(text.ends_with("\n  avoid_ros_namespace_conventions: false\n"), "{text}");
+        assert!(text.lines().all(|line| line.starts_with("- ") || line.starts_with("  ")), "{text}");
+    }
+}

@@ -1,0 +1,194 @@
+//! ROS 2 types: names, definitions as recordings store them, and type hashes.
+
+use super::definitions as of;
+use super::definitions::Definition;
+use super::type_hash::{Distribution, type_hash};
+
+/// A ROS 2 type that this program writes or reads.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum RosType {
+    /// `rosgraph_msgs/msg/Clock`.
+    Clock,
+    /// `vision_msgs/msg/Detection3DArray`.
+    Detection3dArray,
+    /// `diagnostic_msgs/msg/DiagnosticArray`.
+    DiagnosticArray,
+    /// `visualization_msgs/msg/MarkerArray`.
+    MarkerArray,
+    /// `nav_msgs/msg/Odometry`.
+    Odometry,
+    /// `sensor_msgs/msg/PointCloud2`.
+    PointCloud2,
+    /// `geometry_msgs/msg/PoseWithCovarianceStamped`.
+    PoseWithCovarianceStamped,
+    /// `tf2_msgs/msg/TFMessage`.
+    TfMessage,
+}
+
+impl RosType {
+    /// Every type.
+    pub const ALL: [Self; 8] = [
+        Self::Clock,
+        Self::Detection3dArray,
+        Self::DiagnosticArray,
+        Self::MarkerArray,
+        Self::Odometry,
+        Self::PointCloud2,
+        Self::PoseWithCovarianceStamped,
+        Self::TfMessage,
+    ];
+
+    /// Name in ROS 2: `sensor_msgs/msg/PointCloud2`.
+    #[must_use]
+    pub fn name(self) -> String {
+        let (package, name) = self.parts();
+        format!("{package}/msg/{name}")
+    }
+
+    /// Name on the wire: `sensor_msgs::msg::dds_::PointCloud2_`.
+    #[must_use]
+    pub fn dds_name(self) -> String {
+        let (package, name) = self.parts();
+        format!("{package}::msg::dds_::{name}_")
+    }
+
+    /// Type hash as distributions write it in keys: `RIHS01_...`.
+    #[must_use]
+    pub fn hash(self, distribution: Distribution) -> String {
+        match distribution {
+            Distribution::Humble => Distribution::NO_HASH.into(),
+            Distribution::Jazzy => {
+                let (own, contained) = self.definitions();
+                type_hash(own, contained)
+            }
+        }
+    }
+
+    /// Definition with those of all contained types, for schemas of encoding `ros2msg`: the fields of the type, then
+    /// those of the others, each after a line of 80 `=` and a line `MSG: package/Type`.
+    #[must_use]
+    pub fn schema(self) -> String {
+        let ((_, own), contained) = self.definitions();
+        let separator = "=".repeat(80);
+        let with = |text: String, (name, fields): &Definition| text + &format!("{separator}\nMSG: {name}\n{fields}");
+        contained.iter().fold((*own).to_owned(), with)
+    }
+
+    /// Package and name.
+    fn parts(self) -> (&'static str, &'static str) {
+        let ((name, _), _) = self.definitions();
+        name.split_once('/').unwrap_or(("", name))
+    }
+
+    /// Own definition, and those of all contained types.
+    fn definitions(self) -> (&'static Definition, &'static [Definition]) {
+        match self {
+            Self::Clock => (&of::CLOCK, &[of::TIME]),
+            Self::Detection3dArray => (
+                &of::DETECTION_3D_ARRAY,
+                &[
+                    of::HEADER,
+                    of::TIME,
+                    of::DETECTION_3D,
+                    of::HYPOTHESIS_WITH_POSE,
+                    of::HYPOTHESIS,
+                    of::POSE_WITH_COVARIANCE,
+                    of::POSE,
+                    of::POINT,
+                    of::QUATERNION,
+                    of::BOUNDING_BOX_3D,
+                    of::VECTOR,
+                ],
+            ),
+            Self::DiagnosticArray => {
+                (&of::DIAGNOSTIC_ARRAY, &[of::HEADER, of::TIME, of::DIAGNOSTIC_STATUS, of::KEY_VALUE])
+            }
+            Self::MarkerArray => (
+                &of::MARKER_ARRAY,
+                &[
+                    of::MARKER,
+                    of::HEADER,
+                    of::TIME,
+                    of::POSE,
+                    of::POINT,
+                    of::QUATERNION,
+                    of::VECTOR,
+                    of::COLOR,
+                    of::DURATION,
+                    of::COMPRESSED_IMAGE,
+                    of::UV_COORDINATE,
+                    of::MESH_FILE,
+                ],
+            ),
+            Self::Odometry => (
+                &of::ODOMETRY,
+                &[
+                    of::HEADER,
+                    of::TIME,
+                    of::POSE_WITH_COVARIANCE,
+                    of::POSE,
+                    of::POINT,
+                    of::QUATERNION,
+                    of::TWIST_WITH_COVARIANCE,
+                    of::TWIST,
+                    of::VECTOR,
+                ],
+            ),
+            Self::PointCloud2 => (&of::POINT_CLOUD_2, &[of::HEADER, of::TIME, of::POINT_FIELD]),
+            Self::PoseWithCovarianceStamped => (
+                &of::POSE_WITH_COVARIANCE_STAMPED,
+                &[of::HEADER, of::TIME, of::POSE_WITH_COVARIANCE, of::POSE, of::POINT, of::QUATERNION],
+            ),
+            Self::TfMessage => (
+                &of::TF_MESSAGE,
+                &[of::TRANSFORM_STAMPED, of::HEADER, of::TIME, of::TRANSFORM, of::VECTOR, of::QUATERNION],
+            ),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_schema_brings_all_types_it_names() {
+        for ros_type in RosType::ALL {
+            let text = ros_type.schema();
+            for word in text.lines().filter(|line| !line.starts_with("MSG:")).filter_map(|line| line.split(' ').next())
+            {
+                let word = word.split('[').next().unwrap();
+                if word.contains('/') {
+                    assert!(text.contains(&format!("MSG: {word}\n")), "{} lacks {word}", ros_type.name());
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn names_are_those_of_ros_and_of_the_wire() {
+        assert_eq!(RosType::PointCloud2.name(), "sensor_msgs/msg/PointCloud2");
+        assert_eq!(RosType::PointCloud2.dds_name(), "sensor_msgs::msg::dds_::PointCloud2_");
+        assert_eq!(RosType::TfMessage.dds_name(), "tf2_msgs::msg::dds_::TFMessage_");
+    }
+
+    /// Hashes of the Jazzy packages, as the packages and public tools print them.
+    #[test]
+    fn hashes_are_those_of_the_distributions() {
+        let known = [
+            (RosType::Clock, "692f7a66e93a3c83e71765d033b60349ba68023a8c689a79e48078bcb5c58564"),
+            (RosType::Detection3dArray, "793f5eab9595ac1c0da07873cc859db42eae51f0ee76056db8562515d830e018"),
+            (RosType::DiagnosticArray, "5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e"),
+            (RosType::MarkerArray, "86cb8800b6fb05b5eff1abd7a56f62a5641d3ae9a1c29e78e67e704f1d067dcf"),
+            (RosType::Odometry, "3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0"),
+            (RosType::PointCloud2, "9198cabf7da3796ae6fe19c4cb3bdd3525492988c70522628af5daa124bae2b5"),
+            (RosType::PoseWithCovarianceStamped, "26432f9803e43727d3c8f668d1fdb3c630f548af631e2f4e31382371bfea3b6e"),
+            (RosType::TfMessage, "e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"),
+        ];
+        assert_eq!(known.map(|(ros_type, _)| ros_type), RosType::ALL);
+        for (ros_type, hash) in known {
+            assert_eq!(ros_type.hash(Distribution::Jazzy), format!("RIHS01_{hash}"), "{}", ros_type.name());
+            assert_eq!(ros_type.hash(Distribution::Humble), "TypeHashNotSupported");
+        }
+    }
+}

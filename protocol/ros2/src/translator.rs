@@ -1,0 +1,201 @@
+//! Translator: what a message of a run is in ROS 2.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use protocol::{CavId, EgoMotion, Message, PoseEstimate, ProcessId, RunId, Stats, Stream, Topic, Truth};
+
+use super::encode::{self, Level, Marked, Status};
+use super::names::{MAP_FRAME, lidar_frame, truth_frame};
+use super::topic::{RosTopic, VehicleTopic};
+
+const DETECTION_RGB: [f32; 3] = [1.0, 0.37, 0.30];
+const TRUTH_RGB: [f32; 3] = [0.25, 0.81, 0.47];
+
+/// A message of ROS 2.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct RosMessage {
+    /// Topic on which it is published.
+    pub topic: RosTopic,
+    /// The message in CDR, with its encapsulation header.
+    pub cdr: Vec<u8>,
+}
+
+/// Translator of the messages of one run. It remembers the last motion of each vehicle, for its odometry, and the losses
+/// of each process, for its diagnosis.
+#[derive(Debug)]
+pub struct Translator {
+    run: RunId,
+    motions: BTreeMap<CavId, (u64, EgoMotion)>,
+    losses: BTreeMap<ProcessId, u64>,
+    /// Latest capture time so far: the stamp of messages without one.
+    latest_nanos: u64,
+}
+
+impl Translator {
+    /// A translator for `run`.
+    #[must_use]
+    pub fn new(run: &RunId) -> Self {
+        Self { run: run.clone(), motions: BTreeMap::new(), losses: BTreeMap::new(), latest_nanos: 0 }
+    }
+
+    /// True if messages of `topic` have to be passed to [`Self::translate`].
+    #[must_use]
+    pub fn wants(topic: &Topic) -> bool {
+        let streams = [Stream::Lidar, Stream::Imu, Stream::Pose, Stream::Detections];
+        match topic {
+            Topic::Truth | Topic::Stats(_) => true,
+            Topic::Stream { stream, .. } => streams.contains(stream),
+            _ => false,
+        }
+    }
+
+    /// The ROS 2 messages for a message published on `topic`, captured at `capture_nanos`; empty if ROS has none for it.
+    pub fn translate(&mut self, topic: &Topic, capture_nanos: u64, message: &Message) -> Vec<RosMessage> {
+        let at = capture_nanos;
+        if matches!(topic, Topic::Stream { .. }) {
+            self.latest_nanos = at;
+        }
+        match (topic, message) {
+            (Topic::Stream { cav, stream: Stream::Lidar }, Message::Lidar(lidar)) => {
+                let cdr = encode::point_cloud(at, &lidar_frame(cav), &lidar.points);
+                vec![of_vehicle(cav, VehicleTopic::Points, cdr)]
+            }
+            (Topic::Stream { cav, stream: Stream::Imu }, Message::Imu(motion)) => {
+                self.motions.insert(cav.clone(), (at, *motion));
+                Vec::new()
+            }
+            (Topic::Stream { cav, stream: Stream::Pose }, Message::Pose(estimate)) => self.pose(cav, at, estimate),
+            (Topic::Stream { cav, stream: Stream::Detections }, Message::Detections(result)) => {
+                let boxes: Vec<Marked> = result.detections.iter().map(Marked::from).collect();
+                let frame = lidar_frame(cav);
+                let detections = encode::detections(at, &frame, &result.detections);
+                let markers = encode::markers(at, &frame, "detections", DETECTION_RGB, &boxes);
+                vec![
+                    of_vehicle(cav, VehicleTopic::Detections, detections),
+                    of_vehicle(cav, VehicleTopic::Markers, markers),
+                ]
+            }
+            (Topic::Truth, Message::Truth(truth)) => truth_messages(at, truth),
+            (Topic::Stats(_), Message::Stats(stats)) => {
+                let status = self.status(stats);
+                let cdr = encode::diagnostics(self.latest_nanos, &[status]);
+                vec![RosMessage { topic: RosTopic::Diagnostics, cdr }]
+            }
+            _ => Vec::new(),
+        }
+    }
+
+    fn pose(&self, cav: &CavId, at: u64, estimate: &PoseEstimate) -> Vec<RosMessage> {
+        let Some(pose) = estimate.world_from_cav() else { return Vec::new() };
+        let motion = self.motions.get(cav).filter(|(nanos, _)| *nanos == at);
+        let motion = motion.map_or(EgoMotion::default(), |(_, motion)| *motion);
+        let covariance = estimate.covariance();
+        let odometry = encode::odometry(at, cav, pose, covariance, motion);
+        // The transform first: a receiver of the others can use them at once.
+        vec![
+            RosMessage { topic: RosTopic::Tf, cdr: encode::transforms(at, &[(lidar_frame(cav), *pose)]) },
+            of_vehicle(cav, VehicleTopic::Pose, encode::pose(at, pose, covariance)),
+            of_vehicle(cav, VehicleTopic::Odometry, odometry),
+        ]
+    }
+
+    /// Status of a process: a warning if it has lost messages since its last report.
+    fn status(&mut self, stats: &Stats) -> Status {
+        let total = stats.ledger.total();
+        let lost = total.dropped_total();
+        let new = lost.saturating_sub(self.losses.insert(stats.process.clone(), lost).unwrap_or(0));
+        let mut values = vec![
+            ("messages sent".to_owned(), total.sent.to_string()),
+            ("messages received".to_owned(), total.received.to_string()),
+        ];
+        values.extend(total.dropped.iter().map(|(reason, count)| (format!("dropped: {reason}"), count.to_string())));
+        values.extend(stats.stages.iter().flat_map(|stage| {
+            [("median", stage.p50_ms), ("95th percentile", stage.p95_ms)]
+                .map(|(what, ms)| (format!("{} {what} (ms)", stage.stage), format!("{ms:.2}")))
+        }));
+        values.push(("CPU time (s)".into(), format!("{:.1}", stats.usage.cpu_s)));
+        values.push(("resident memory (bytes)".into(), stats.usage.resident_bytes.to_string()));
+        Status {
+            level: if new > 0 { Level::Warn } else { Level::Ok },
+            name: format!("v2vloc: {}", stats.process),
+            message: if new > 0 { format!("{new} messages dropped since the last report") } else { "running".into() },
+            hardware_id: self.run.to_string(),
+            values,
+        }
+    }
+}
+
+fn of_vehicle(cav: &CavId, topic: VehicleTopic, cdr: Vec<u8>) -> RosMessage {
+    RosMessage { topic: RosTopic::Vehicle(cav.clone(), topic), cdr }
+}
+
+fn truth_messages(at: u64, truth: &Truth) -> Vec<RosMessage> {
+    let mut seen = BTreeSet::new();
+    let objects = truth.agents.iter().flat_map(|agent| &agent.objects).filter(|object| seen.insert(object.id));
+    let boxes: Vec<Marked> = objects.map(encode::truth_marker).collect();
+    let poses: Vec<_> = truth.agents.iter().map(|agent| (truth_frame(&agent.cav), agent.world_from_lidar)).collect();
+    vec![
+        RosMessage { topic: RosTopic::Tf, cdr: encode::transforms(at, &poses) },
+        RosMessage { topic: RosTopic::Truth, cdr: encode::markers(at, MAP_FRAME, "truth", TRUTH_RGB, &boxes) },
+    ]
+}
+
+#[cfg(test)]
+mod tests {
+    use protocol::{Account, DropReason, Ledger, NoPoseReason, Pose, ProcessUsage};
+
+    use super::*;
+
+    fn topic(stream: Stream) -> Topic {
+        Topic::Stream { cav: CavId::new("1").unwrap(), stream }
+    }
+
+    fn translator() -> Translator {
+        Translator::new(&RunId::new("test").unwrap())
+    }
+
+    #[test]
+    fn a_pose_is_a_transform_a_pose_and_an_odometry_with_the_motion_of_its_time() {
+        let mut translator = translator();
+        let motion = Message::Imu(EgoMotion { speed_mps: Some(7.0), yaw_rate_rad_s: Some(0.5) });
+        assert_eq!(translator.translate(&topic(Stream::Imu), 100, &motion), []);
+        let pose = Message::Pose(PoseEstimate::new(Pose::IDENTITY, 0.9));
+        let speed = |translator: &mut Translator, at| {
+            let messages = translator.translate(&topic(Stream::Pose), at, &pose);
+            let names: Vec<_> = messages.iter().map(|message| message.topic.name(None).to_string()).collect();
+            assert_eq!(names, ["/tf", "/cav_1/pose", "/cav_1/odometry"]);
+            let cdr = &messages[2].cdr;
+            f64::from_le_bytes(*cdr[cdr.len() - 8 * (6 + 36)..].first_chunk().unwrap())
+        };
+        assert_eq!([speed(&mut translator, 100), speed(&mut translator, 200)], [7.0, 0.0]);
+        let none = Message::Pose(PoseEstimate::NoPose { reason: NoPoseReason::TooFewInliers, inlier_count: 3 });
+        assert_eq!(translator.translate(&topic(Stream::Pose), 300, &none), []);
+    }
+
+    #[test]
+    fn a_process_that_loses_messages_is_a_warning_once() {
+        let mut translator = translator();
+        let process = ProcessId::new("agent-1").unwrap();
+        let mut stats = Stats {
+            process: process.clone(),
+            ledger: Ledger::default(),
+            stages: Vec::new(),
+            usage: ProcessUsage::default(),
+            traffic: Vec::new(),
+        };
+        let mut level = |stats: &Stats| translator.status(stats).level;
+        assert_eq!(level(&stats), Level::Ok);
+        stats.ledger.dropped(&Account::towards(topic(Stream::Lidar), &process), DropReason::Superseded);
+        assert_eq!([level(&stats), level(&stats)], [Level::Warn, Level::Ok]);
+        let message = Message::Stats(stats);
+        let messages = translator.translate(&Topic::Stats(process), 0, &message);
+        let has = |text: &[u8]| messages[0].cdr.windows(text.len()).any(|bytes| bytes == text);
+        assert!(has(b"v2vloc: agent-1\0") && has(b"dropped: superseded\0") && has(b"test\0"));
+    }
+
+    #[test]
+    fn only_streams_that_ros_has_types_for_are_wanted() {
+        assert!(Translator::wants(&topic(Stream::Lidar)) && Translator::wants(&Topic::Truth));
+        assert!(!Translator::wants(&topic(Stream::Bev)) && !Translator::wants(&topic(Stream::DetectionsJson)));
+    }
+}

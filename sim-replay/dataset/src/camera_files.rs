@@ -1,0 +1,119 @@
+//! Camera images of the OPV2V family: their files beside the sweeps, and their calibration in the frame's YAML.
+
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+
+use imagesize::ImageSize;
+use nalgebra::{Isometry3, Matrix3, Rotation3, UnitQuaternion};
+use protocol::{Camera, CameraMetadata, ImageFormat, Pinhole, Pose};
+
+use super::ReadError;
+use super::files;
+use super::yaml::Field;
+
+/// Prefixes of the number of a camera in file names and in the YAML: OPV2V's and V2X-Real's.
+const PREFIXES: [&str; 2] = ["camera", "cam"];
+/// Endings of image files.
+const ENDINGS: [&str; 3] = ["png", "jpg", "jpeg"];
+/// Largest image file that is read, bytes.
+const MAX_BYTES: u64 = 32 << 20;
+
+/// Numbers of the cameras that have images among the files of an agent.
+pub(super) fn numbers(names: &[String]) -> BTreeSet<u8> {
+    names.iter().filter_map(|name| number(name)).collect()
+}
+
+/// The camera of `<stem>_camera<k>.png`.
+fn number(name: &str) -> Option<u8> {
+    let (name, ending) = name.rsplit_once('.')?;
+    let (_, camera) = name.rsplit_once('_')?;
+    let digits = PREFIXES.iter().find_map(|prefix| camera.strip_prefix(prefix))?;
+    let is_image = ENDINGS.iter().any(|known| ending.eq_ignore_ascii_case(known));
+    (is_image && digits.bytes().all(|byte| byte.is_ascii_digit())).then(|| digits.parse().ok()).flatten()
+}
+
+/// The image of a camera beside `dir/stem.yaml`; `None` if there is none.
+pub(super) fn find(dir: &Path, stem: &str, number: u8) -> Option<PathBuf> {
+    let names = PREFIXES
+        .iter()
+        .flat_map(|prefix| ENDINGS.iter().map(move |ending| dir.join(format!("{stem}_{prefix}{number}.{ending}"))));
+    names.into_iter().find(|path| path.is_file())
+}
+
+/// Reads an image; its calibration is that of the entry for the camera in `root`, if there is one.
+///
+/// `world_from_lidar` and the poses of the cameras in the file are as `pose` reads them.
+pub(super) fn read(
+    path: &Path,
+    number: u8,
+    root: &Field<'_>,
+    pose: &dyn Fn(&Field<'_>) -> Result<Pose, ReadError>,
+) -> Result<Camera, ReadError> {
+    let image = files::read_limited(path, MAX_BYTES)?;
+    let format = ImageFormat::of_bytes(&image)
+        .ok_or_else(|| ReadError::malformed(path, "neither a PNG nor a JPEG by its first bytes"))?;
+    let ImageSize { width, height } =
+        imagesize::blob_size(&image).map_err(|error| ReadError::malformed(path, error.to_string()))?;
+    let edge = |edge: usize| u32::try_from(edge).unwrap_or(u32::MAX);
+    let mut metadata = CameraMetadata {
+        format,
+        width_px: edge(width),
+        height_px: edge(height),
+        pinhole: None,
+        lidar_from_camera: None,
+    };
+    for prefix in PREFIXES {
+        let Some(entry) = root.optional(&format!("{prefix}{number}"))? else { continue };
+        metadata.pinhole = entry.optional("intrinsic")?.map(|field| pinhole(&field)).transpose()?;
+        if let (Some(cords), Some(lidar)) = (entry.optional("cords")?, root.optional("lidar_pose")?) {
+            metadata.lidar_from_camera = Some(lidar_from_camera(&pose(&lidar)?, &pose(&cords)?));
+        }
+    }
+    Ok(Camera { metadata, image })
+}
+
+fn pinhole(field: &Field<'_>) -> Result<Pinhole, ReadError> {
+    let rows = field.items()?;
+    let rows = rows.iter().map(Field::numbers::<3>).collect::<Result<Vec<_>, _>>()?;
+    match rows.as_slice() {
+        &[[fx_px, _, cx_px], [_, fy_px, cy_px], _] => Ok(Pinhole { fx_px, fy_px, cx_px, cy_px }),
+        _ => Err(field.error(format!("{} rows, expected 3", rows.len()))),
+    }
+}
+
+/// The optical frame, z ahead, x right, y down, in the frame of a camera that looks along x, with y left and z up.
+#[must_use]
+pub fn body_from_optical() -> Isometry3<f64> {
+    let axes = Matrix3::new(0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, -1.0, 0.0);
+    let rotation = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(axes));
+    Isometry3::from_parts(nalgebra::Translation3::identity(), rotation)
+}
+
+fn lidar_from_camera(world_from_lidar: &Pose, world_from_body: &Pose) -> Pose {
+    let lidar_from_body = world_from_lidar.isometry().inv_mul(&world_from_body.isometry());
+    (lidar_from_body * body_from_optical()).into()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn images_are_told_by_their_names() {
+        let names = ["000069_camera0.png", "000069_camera3.JPG", "000069_cam2.jpeg", "000069_camera_gt.png", "a.png"];
+        let found = numbers(&names.map(str::to_owned));
+        assert_eq!(found.into_iter().collect::<Vec<_>>(), [0, 2, 3]);
+    }
+
+    #[test]
+    fn a_camera_that_looks_ahead_sees_what_is_ahead_in_its_middle() {
+        let lidar = Pose::from_xyz_yaw([10.0, 5.0, 1.9], 0.3);
+        let ahead = lidar.isometry() * Isometry3::translation(3.0, 0.0, -0.9);
+        let found = lidar_from_camera(&lidar, &ahead.into()).isometry();
+        let point = found.inverse() * nalgebra::Point3::new(13.0, 1.0, -1.9);
+        assert!((point.coords - nalgebra::Vector3::new(-1.0, 1.0, 10.0)).norm() < 1e-9, "{point}");
+        let pinhole = Pinhole { fx_px: 100.0, fy_px: 100.0, cx_px: 50.0, cy_px: 40.0 };
+        assert_eq!(pinhole.project([-1.0, 1.0, 10.0]), Some([40.0, 50.0]));
+        assert_eq!(pinhole.project([0.0, 0.0, -1.0]), None);
+    }
+}

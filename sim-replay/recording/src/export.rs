@@ -1,0 +1,91 @@
+//! Export: a bag of ROS 2 from a recording.
+
+use std::collections::BTreeSet;
+use std::path::Path;
+
+use protocol::{CavId, Topic};
+use ros2::{Mount, Translator};
+use serde::Serialize;
+
+use super::{Contents, Damage, Entry, Recording, RecordingError, RecordingOptions, RecordingWriter};
+
+/// Times of the messages in a bag.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum ExportTimes {
+    /// Capture times, as in the headers: `ros2 bag play --clock` gives `/clock` and stamps on one time base. Latencies are
+    /// lost.
+    #[default]
+    Capture,
+    /// Times of arrival at the recorder, on the Unix clock.
+    Arrival,
+}
+
+/// Result of an export.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct ExportReport {
+    /// Messages of the run that are in the bag, counted once.
+    pub messages: u64,
+    /// Messages that ROS 2 has no type for, feature maps for example.
+    pub left_out: u64,
+    /// Parts of the recording that could not be read.
+    pub damage: Vec<Damage>,
+}
+
+/// Writes what ROS 2 has types for in the recording `from` into the new bag `to`: every channel has a schema, encoding
+/// `cdr` and a quality of service, and times are in order.
+///
+/// # Errors
+/// [`RecordingError`] if `from` holds no message of this program, or `to` exists already or cannot be written.
+pub fn export_ros2(
+    from: &Path,
+    to: &Path,
+    times: ExportTimes,
+    mount: &Mount,
+    zstd_level: Option<u32>,
+) -> Result<ExportReport, RecordingError> {
+    let recording = Recording::open(from)?;
+    let nanos = |entry: &Entry| match times {
+        ExportTimes::Capture if matches!(entry.key.topic, Topic::Stats(_)) => None,
+        ExportTimes::Capture => Some(entry.header.stamp.capture_nanos),
+        ExportTimes::Arrival => Some(entry.arrived_nanos),
+    };
+    let wanted: Vec<&Entry> = recording.entries().iter().filter(|entry| Translator::wants(&entry.key.topic)).collect();
+    let timed = in_order(&wanted, nanos);
+    if timed.is_empty() {
+        let reason = "it holds no message that can be read and that ROS 2 has a type for; recordings of other versions of this program cannot be read";
+        return Err(RecordingError::NotOurs { path: from.into(), reason: reason.into() });
+    }
+    let options = RecordingOptions { zstd_level, contents: Contents::Ros2 };
+    let mut writer = RecordingWriter::create(to, options)?;
+    let vehicles: BTreeSet<CavId> = wanted.iter().filter_map(|entry| vehicle(&entry.key.topic)).collect();
+    if let Some((first, _)) = timed.first().filter(|_| !vehicles.is_empty()) {
+        writer.write_static_transforms(*first, &vehicles, mount)?;
+    }
+    for (nanos, entry) in timed {
+        writer.write(&entry.key, nanos, &recording.read(entry)?)?;
+    }
+    writer.finish()?;
+    let messages = writer.whole_messages();
+    let left_out = (recording.entries().len() as u64).saturating_sub(messages);
+    Ok(ExportReport { messages, left_out, damage: recording.damage().to_vec() })
+}
+
+/// Entries by time. One without a time of its own gets that of the entry before it.
+fn in_order<'a>(entries: &[&'a Entry], nanos: impl Fn(&Entry) -> Option<u64>) -> Vec<(u64, &'a Entry)> {
+    let first = entries.iter().find_map(|entry| nanos(entry)).unwrap_or(0);
+    let mut latest = first;
+    let timed = entries.iter().map(|entry| {
+        latest = nanos(entry).unwrap_or(latest);
+        (latest, *entry)
+    });
+    let mut timed: Vec<_> = timed.collect();
+    timed.sort_by_key(|(nanos, _)| *nanos);
+    timed
+}
+
+fn vehicle(topic: &Topic) -> Option<CavId> {
+    match topic {
+        Topic::Stream { cav, .. } => Some(cav.clone()),
+        _ => None,
+    }
+}

@@ -1,0 +1,194 @@
+//! The four cameras of the vehicles: ahead, to both sides and back, 100 degrees wide, rendered from the geometry that
+//! the LiDAR hits.
+
+mod paint;
+mod png_image;
+mod shading;
+
+use std::fmt;
+use std::str::FromStr;
+
+use nalgebra::{Isometry3, Matrix3, Rotation3, Translation3, UnitQuaternion, Vector3};
+use protocol::{Camera, CameraMetadata, ImageFormat, Pinhole};
+
+pub(super) use paint::{Paint, of_shape, of_vehicle};
+pub(super) use shading::GroundPaint;
+
+use super::lidar::LIDAR_MOUNT_M;
+use super::raycast::{Body, Caster, Placement, RayPattern, Surface, Sweep};
+use super::weather::Weather;
+use shading::{Rendered, Shader};
+
+/// Field of view along the rows, degrees: that of OPV2V's cameras.
+const FIELD_OF_VIEW_DEG: f64 = 100.0;
+/// Rays per pixel on the optical axis, along rows and columns.
+const RAYS_PER_PIXEL: f64 = 1.6;
+/// Range, metres; what is farther is sky.
+const RANGE_M: f32 = 150.0;
+
+/// Size of the images.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ImageSize {
+    /// Columns.
+    pub width_px: u32,
+    /// Rows.
+    pub height_px: u32,
+}
+
+impl ImageSize {
+    /// Columns and rows.
+    pub(super) fn edges_px(self) -> [u32; 2] {
+        [self.width_px, self.height_px]
+    }
+}
+
+impl fmt::Display for ImageSize {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}x{}", self.width_px, self.height_px)
+    }
+}
+
+impl FromStr for ImageSize {
+    type Err = String;
+
+    /// Reads `WIDTHxHEIGHT`.
+    fn from_str(text: &str) -> Result<Self, String> {
+        let edges = text.split_once('x').and_then(|(width, height)| Some((width.parse().ok()?, height.parse().ok()?)));
+        let (width_px, height_px) =
+            edges.ok_or_else(|| format!("{text:?} is not WIDTHxHEIGHT, for example 480x300"))?;
+        Ok(Self { width_px, height_px })
+    }
+}
+
+/// Mount of a camera on its vehicle: x forward, y left, z up from the ground under the centre.
+struct Mount {
+    position_m: [f64; 3],
+    yaw_deg: f64,
+}
+
+/// The mounts of OPV2V and V2VLoc, by number.
+const MOUNTS: [Mount; 4] = [
+    Mount { position_m: [2.5, 0.0, 1.0], yaw_deg: 0.0 },
+    Mount { position_m: [0.0, -0.3, 1.8], yaw_deg: -100.0 },
+    Mount { position_m: [0.0, 0.3, 1.8], yaw_deg: 100.0 },
+    Mount { position_m: [-2.0, 0.0, 1.5], yaw_deg: 180.0 },
+];
+
+/// A camera that keeps its buffers from one image to the next.
+#[derive(Debug, Clone)]
+struct MountedCamera {
+    position_m: Vector3<f64>,
+    caster: Caster,
+    metadata: CameraMetadata,
+    /// Column and channel of the ray of each pixel, row by row.
+    rays: Vec<(u32, u32)>,
+}
+
+/// The cameras of one thread, for all vehicles in turn.
+#[derive(Debug, Clone)]
+pub(super) struct CameraRig {
+    cameras: Vec<MountedCamera>,
+    size: ImageSize,
+}
+
+/// Surroundings of a vehicle as its cameras see them.
+pub(super) struct Surroundings<'a> {
+    pub(super) ground: &'a dyn Surface,
+    pub(super) bodies: &'a [Body<'a>],
+    /// Paint of each body.
+    pub(super) paints: &'a [Paint],
+    pub(super) weather: Weather,
+}
+
+impl CameraRig {
+    pub(super) fn new(size: ImageSize) -> Self {
+        Self { cameras: MOUNTS.iter().map(|mount| MountedCamera::new(mount, size)).collect(), size }
+    }
+
+    /// The images of all cameras on a vehicle at `vehicle`, by number. The same arguments give the same bytes.
+    pub(super) fn images(
+        &mut self,
+        vehicle: &Placement,
+        surroundings: &Surroundings<'_>,
+        ground_paint: &mut GroundPaint<'_>,
+        seed: u64,
+    ) -> Vec<(u8, Camera)> {
+        let size = self.size;
+        let images = self.cameras.iter_mut().zip(0u8..).map(|(camera, number)| {
+            let rendered = camera.render(vehicle, surroundings, ground_paint, seed.wrapping_add(number.into()));
+            (number, Camera { metadata: camera.metadata, image: png_image::encode(&rendered.rgb, size) })
+        });
+        images.collect()
+    }
+}
+
+impl MountedCamera {
+    fn new(mount: &Mount, size: ImageSize) -> Self {
+        let (width, height) = (f64::from(size.width_px), f64::from(size.height_px));
+        let focal_px = width / 2.0 / (FIELD_OF_VIEW_DEG.to_radians() / 2.0).tan();
+        let pinhole = Pinhole { fx_px: focal_px, fy_px: focal_px, cx_px: width / 2.0, cy_px: height / 2.0 };
+        let yaw_rad = mount.yaw_deg.to_radians();
+        let step_rad = 1.0 / (RAYS_PER_PIXEL * focal_px);
+        let half_rad = [width, height].map(|edge| (edge / 2.0 / focal_px).atan() + 2.0 * step_rad);
+        let count = |half_rad: f64| (2.0 * half_rad / step_rad).ceil() as usize + 1;
+        let pattern = RayPattern {
+            first_azimuth_rad: (yaw_rad + half_rad[0]) as f32,
+            azimuth_step_rad: -step_rad as f32,
+            columns: count(half_rad[0]),
+            first_elevation_rad: -half_rad[1] as f32,
+            elevation_step_rad: step_rad as f32,
+            channels: count(half_rad[1]),
+            range_m: RANGE_M,
+            rolling: false,
+        };
+        let nearest = |angle_rad: f64, first_rad: f64| ((angle_rad - first_rad) / step_rad).round().max(0.0) as u32;
+        let pixels = (0..size.height_px).flat_map(|row| (0..size.width_px).map(move |column| (row, column)));
+        let rays = pixels.map(|(row, column)| {
+            // Through the middle of the pixel: to the left and up, for one unit ahead.
+            let left = -(f64::from(column) + 0.5 - pinhole.cx_px) / focal_px;
+            let up = -(f64::from(row) + 0.5 - pinhole.cy_px) / focal_px;
+            let (azimuth, elevation) = (left.atan(), (up / left.hypot(1.0)).atan());
+            (nearest(-azimuth, -half_rad[0]), nearest(elevation, -half_rad[1]))
+        });
+        let position_m = Vector3::from(mount.position_m);
+        Self {
+            rays: rays.collect(),
+            metadata: CameraMetadata {
+                format: ImageFormat::Png,
+                width_px: size.width_px,
+                height_px: size.height_px,
+                pinhole: Some(pinhole),
+                lidar_from_camera: Some(lidar_from_camera(position_m, yaw_rad).into()),
+            },
+            position_m,
+            caster: Caster::new(pattern),
+        }
+    }
+
+    fn render(
+        &mut self,
+        vehicle: &Placement,
+        surroundings: &Surroundings<'_>,
+        ground_paint: &mut GroundPaint<'_>,
+        seed: u64,
+    ) -> Rendered {
+        let sensor = Sweep::still(vehicle.mounted(self.position_m.into()));
+        // At the end of the sweep, the capture time, everything stands where it is then.
+        let bodies: Vec<Body<'_>> =
+            surroundings.bodies.iter().map(|body| Body { motion: Sweep::still(body.motion.end), ..*body }).collect();
+        self.caster.cast(&sensor, surroundings.ground, &bodies);
+        let shader = Shader::new(&self.caster, &sensor, surroundings.paints, surroundings.weather);
+        shader.render(&self.rays, ground_paint, seed)
+    }
+}
+
+/// Pose of the optical frame, z ahead, x right, y down, in the LiDAR's.
+fn lidar_from_camera(position_m: Vector3<f64>, yaw_rad: f64) -> Isometry3<f64> {
+    let optical = Matrix3::new(0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, -1.0, 0.0);
+    let axes = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(optical));
+    let turned = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw_rad);
+    Isometry3::from_parts(Translation3::from(position_m - Vector3::from(LIDAR_MOUNT_M)), turned * axes)
+}
+
+#[cfg(test)]
+mod tests;

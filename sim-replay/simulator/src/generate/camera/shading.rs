@@ -1,0 +1,205 @@
+//! Shading of a camera image: material, sun and air along the ray of every pixel.
+
+use std::collections::HashMap;
+
+use nalgebra::{Matrix3, Vector3};
+
+use super::paint::{Colour, Paint};
+use crate::generate::raycast::{Caster, GROUND, MISS, RangeImage, SkewedColumn, Sweep};
+use crate::generate::weather::Weather;
+use crate::generate::world::World;
+use support::random::SplitMix64;
+
+/// Direction towards the sun in the world.
+const SUN: [f32; 3] = [0.53, -0.33, 0.78];
+/// Share of the light that comes from the sky.
+const AMBIENT: f32 = 0.45;
+const ASPHALT: Colour = [0.26, 0.26, 0.27];
+const GRASS: Colour = [0.33, 0.40, 0.20];
+const SNOW: Colour = [0.88, 0.89, 0.92];
+const WINDOW: Colour = [0.16, 0.20, 0.26];
+const ZENITH: Colour = [0.35, 0.55, 0.86];
+const HORIZON: Colour = [0.78, 0.85, 0.92];
+const CLOUD: Colour = [0.74, 0.76, 0.78];
+/// Height of a storey, and the parts of it that are window, metres and shares.
+const STOREY_M: f32 = 3.0;
+const WINDOW_ROWS: [f32; 2] = [0.35, 0.8];
+/// Edge of a cell of ground of one material, metres.
+const GROUND_CELL_M: f64 = 0.4;
+/// Distance from a lane's centre line that is still road beside its half width, metres.
+const SHOULDER_M: f64 = 0.3;
+/// Largest lane that is looked for, metres.
+const WIDEST_LANE_M: f64 = 6.0;
+/// Share of pixels with a flake before it, in snow.
+const FLAKES: f64 = 0.01;
+
+/// Material of the ground, looked up once for each cell.
+pub(crate) struct GroundPaint<'w> {
+    world: &'w World<'w>,
+    is_road: HashMap<[i32; 2], bool>,
+}
+
+impl<'w> GroundPaint<'w> {
+    pub(crate) fn new(world: &'w World<'w>) -> Self {
+        Self { world, is_road: HashMap::new() }
+    }
+
+    fn colour(&mut self, place_m: &Vector3<f64>, weather: Weather) -> Colour {
+        let cell = [place_m.x, place_m.y].map(|axis| (axis / GROUND_CELL_M).floor() as i32);
+        let world = self.world;
+        let is_road = *self.is_road.entry(cell).or_insert_with(|| {
+            let middle = cell.map(|axis| (f64::from(axis) + 0.5) * GROUND_CELL_M);
+            let lanes = &world.map_model.lanes;
+            let nearest = world.lane_index.nearest(lanes, middle, WIDEST_LANE_M, None, None);
+            nearest.is_some_and(|at| at.offset_m.abs() < lanes.lane(at.lane).width_m / 2.0 + SHOULDER_M)
+        });
+        // A little of each cell's own, so that flat ground shows its distance.
+        let seed = (u64::from(cell[0].cast_unsigned()) << 32) | u64::from(cell[1].cast_unsigned());
+        let grain = 0.94 + 0.12 * SplitMix64::new(seed).unit() as f32;
+        let colour = match (weather, is_road) {
+            (Weather::Snow, false) => SNOW,
+            (Weather::Snow, true) => mix(ASPHALT, SNOW, 0.55),
+            (_, true) => ASPHALT,
+            (_, false) => GRASS,
+        };
+        colour.map(|part| part * grain)
+    }
+}
+
+/// A rendered image.
+pub(super) struct Rendered {
+    /// Three bytes a pixel, row by row.
+    pub(super) rgb: Vec<u8>,
+    /// Distance of the first hit along the ray of each pixel, metres.
+    #[cfg(test)]
+    pub(super) depths_m: Vec<f32>,
+}
+
+/// Light of one exposure.
+pub(super) struct Shader<'a> {
+    image: &'a RangeImage,
+    channels: usize,
+    columns: Vec<SkewedColumn>,
+    elevations: Vec<(f32, f32)>,
+    world_from_sensor: Matrix3<f32>,
+    origin_m: Vector3<f64>,
+    paints: &'a [Paint],
+    weather: Weather,
+}
+
+impl<'a> Shader<'a> {
+    pub(super) fn new(caster: &'a Caster, sensor: &Sweep, paints: &'a [Paint], weather: Weather) -> Self {
+        Self {
+            image: caster.image(),
+            channels: caster.pattern().channels,
+            columns: caster.columns_at_end(sensor).collect(),
+            elevations: caster.elevations().collect(),
+            world_from_sensor: sensor.end.rotation().cast(),
+            origin_m: sensor.end.position_m,
+            paints,
+            weather,
+        }
+    }
+
+    /// The image whose pixels have these rays.
+    pub(super) fn render(&self, rays: &[(u32, u32)], ground: &mut GroundPaint<'_>, seed: u64) -> Rendered {
+        let mut random = SplitMix64::new(seed);
+        let mut rgb = Vec::with_capacity(3 * rays.len());
+        for &(column, channel) in rays {
+            let mut colour = self.colour(column as usize, channel as usize, ground);
+            if self.weather == Weather::Snow && random.chance(FLAKES) {
+                colour = mix(colour, SNOW, 0.7);
+            }
+            rgb.extend(colour.map(|part| (255.0 * part.clamp(0.0, 1.0).powf(1.0 / 1.8)).round() as u8));
+        }
+        Rendered {
+            rgb,
+            #[cfg(test)]
+            depths_m: rays
+                .iter()
+                .map(|&(column, channel)| self.image.depths_m[self.ray(column as usize, channel as usize)])
+                .collect(),
+        }
+    }
+
+    fn ray(&self, column: usize, channel: usize) -> usize {
+        column.min(self.columns.len() - 1) * self.channels + channel.min(self.channels - 1)
+    }
+
+    fn colour(&self, column: usize, channel: usize, ground: &mut GroundPaint<'_>) -> Colour {
+        let ray = self.ray(column, channel);
+        let (hit, depth_m) = (self.image.hits[ray], self.image.depths_m[ray]);
+        let sky = self.sky(channel);
+        if hit == MISS {
+            return sky;
+        }
+        let place = self.origin_m + (self.world_from_sensor * self.point(column, channel, depth_m)).cast::<f64>();
+        let material = match hit {
+            GROUND => ground.colour(&place, self.weather),
+            body => self.paint(body as usize, place.z as f32),
+        };
+        let facing = self.normal(column, channel).dot(&Vector3::from(SUN).normalize()).max(0.0);
+        let sun = if self.weather == Weather::Sunny { 1.0 - AMBIENT } else { 0.3 };
+        let lit = material.map(|part| part * (AMBIENT + (1.0 - AMBIENT - sun) * 0.5 + sun * facing * 1.3));
+        mix(lit, sky, 1.0 - (-depth_m / self.haze_m()).exp())
+    }
+
+    fn paint(&self, body: usize, height_m: f32) -> Colour {
+        match self.paints.get(body) {
+            Some(Paint::Vehicle(colour) | Paint::Plain(colour)) => *colour,
+            Some(Paint::Wall(colour)) => {
+                let share = (height_m / STOREY_M).rem_euclid(1.0);
+                if (WINDOW_ROWS[0]..WINDOW_ROWS[1]).contains(&share) { mix(*colour, WINDOW, 0.6) } else { *colour }
+            }
+            None => [0.5; 3],
+        }
+    }
+
+    /// Distance at which 1/e of the contrast remains, metres.
+    fn haze_m(&self) -> f32 {
+        match self.weather {
+            Weather::Sunny => 900.0,
+            Weather::Fog => 17.0,
+            Weather::Snow => 120.0,
+        }
+    }
+
+    fn sky(&self, channel: usize) -> Colour {
+        let (_, sine) = self.elevations[channel.min(self.channels - 1)];
+        match self.weather {
+            Weather::Sunny => mix(HORIZON, ZENITH, sine.max(0.0).sqrt()),
+            Weather::Fog | Weather::Snow => CLOUD,
+        }
+    }
+
+    /// Point at a range along a ray, in the axes of the sensor, from its origin.
+    fn point(&self, column: usize, channel: usize, range_m: f32) -> Vector3<f32> {
+        let column = &self.columns[column.min(self.columns.len() - 1)];
+        Vector3::from(column.point_m(self.elevations[channel.min(self.channels - 1)], range_m))
+    }
+
+    /// Normal of the surface, from the neighbouring rays that hit the same body, in the world.
+    fn normal(&self, column: usize, channel: usize) -> Vector3<f32> {
+        let ray = self.ray(column, channel);
+        let here = self.point(column, channel, self.image.depths_m[ray]);
+        let towards = |(column, channel): (usize, usize)| {
+            let other = self.ray(column, channel);
+            let is_same = other != ray && self.image.hits[other] == self.image.hits[ray];
+            is_same.then(|| self.point(column, channel, self.image.depths_m[other]) - here)
+        };
+        let along = |next: (usize, usize), before: (usize, usize)| {
+            towards(next).or_else(|| towards(before).map(|difference| -difference))
+        };
+        let across = along((column + 1, channel), (column.saturating_sub(1), channel));
+        let up = along((column, channel + 1), (column, channel.saturating_sub(1)));
+        let (Some(across), Some(up)) = (across, up) else { return Vector3::z() };
+        let normal = across.cross(&up);
+        let towards_sensor = if normal.dot(&here) > 0.0 { -normal } else { normal };
+        let length = towards_sensor.norm();
+        if length > 0.0 { self.world_from_sensor * towards_sensor / length } else { Vector3::z() }
+    }
+}
+
+fn mix(a: Colour, b: Colour, share: f32) -> Colour {
+    std::array::from_fn(|part| a[part] + (b[part] - a[part]) * share)
+}

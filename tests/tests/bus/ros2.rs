@@ -1,0 +1,336 @@
+//! ROS 2 network: the node seen by a subscriber and a publisher that speak rmw_zenoh with a decoder of their own.
+
+use std::collections::BTreeSet;
+use std::sync::mpsc::{Receiver, channel};
+use std::thread::ScopedJoinHandle;
+use std::time::{Duration, Instant};
+
+use bus::bounded_queue::Pop;
+use bus::shutdown::Stop;
+use bus::{Bus, BusOptions, Event, PublisherOptions};
+use deploy::ros::{NodeOptions, NodeReport, RosSession, run};
+use protocol::{
+    Box3d, CavId, Detection, Detections, EgoMotion, Lidar, Limits, PlanarCovariance, PointCloud, Pose, PoseEstimate,
+    Role, Stream, Topic,
+};
+use re_cdr::{CdrReader, CdrWriter, LittleEndian};
+use ros2::endpoint::Attachment;
+use ros2::{Distribution, RosType};
+use tests::bus::{TIMEOUT, TestRouter, next_event, wait_for};
+use zenoh::liveliness::LivelinessToken;
+use zenoh::{Session, Wait};
+use zenoh_ext::{AdvancedSubscriberBuilderExt, HistoryConfig};
+
+const DOMAIN: u32 = 3;
+
+fn cav() -> CavId {
+    CavId::new("1000").unwrap()
+}
+
+fn topic(stream: Stream) -> Topic {
+    Topic::Stream { cav: cav(), stream }
+}
+
+/// A session of another node.
+fn other_node(router: &TestRouter) -> Session {
+    bus::open(&BusOptions::client(router.endpoint.clone())).unwrap()
+}
+
+/// Runs the node on a router until `stop`.
+fn start<'scope>(
+    scope: &'scope std::thread::Scope<'scope, '_>,
+    router: &'scope TestRouter,
+    (distribution, options): (Distribution, NodeOptions),
+    stop: &Stop,
+) -> ScopedJoinHandle<'scope, NodeReport> {
+    let stop = stop.clone();
+    scope.spawn(move || {
+        let bus = router.join("ros2", "ros2");
+        let session = RosSession::declare(other_node(router), DOMAIN, None, distribution).unwrap();
+        let report = run(&bus, &session, &options, &stop).unwrap();
+        drop(session);
+        bus.leave(TIMEOUT).unwrap();
+        report
+    })
+}
+
+/// Key of a topic's messages, as written in documents of rmw_zenoh.
+fn key(topic: &str, ros_type: &str, hash: &str) -> String {
+    format!("{DOMAIN}/{topic}/{ros_type}/{hash}")
+}
+
+const POSE: &str = "geometry_msgs::msg::dds_::PoseWithCovarianceStamped_";
+const POSE_HASH: &str = "RIHS01_26432f9803e43727d3c8f668d1fdb3c630f548af631e2f4e31382371bfea3b6e";
+const POINTS: &str = "sensor_msgs::msg::dds_::PointCloud2_";
+const POINTS_HASH: &str = "RIHS01_9198cabf7da3796ae6fe19c4cb3bdd3525492988c70522628af5daa124bae2b5";
+const TF: &str = "tf2_msgs::msg::dds_::TFMessage_";
+const TF_HASH: &str = "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087";
+const CLOCK: &str = "rosgraph_msgs::msg::dds_::Clock_";
+const CLOCK_HASH: &str = "RIHS01_692f7a66e93a3c83e71765d033b60349ba68023a8c689a79e48078bcb5c58564";
+const DETECTIONS: &str = "vision_msgs::msg::dds_::Detection3DArray_";
+const DETECTIONS_HASH: &str = "RIHS01_793f5eab9595ac1c0da07873cc859db42eae51f0ee76056db8562515d830e018";
+
+/// Body and attachment of the messages on a key.
+struct Subscriber {
+    messages: Receiver<(Vec<u8>, Attachment)>,
+    _subscriber: zenoh::pubsub::Subscriber<()>,
+}
+
+impl Subscriber {
+    fn open(session: &Session, key: &str) -> Self {
+        let (sender, messages) = channel();
+        let subscriber = session.declare_subscriber(key.to_owned()).callback(move |sample| {
+            let attachment = sample.attachment().expect("rmw_zenoh needs one").to_bytes();
+            let attachment = Attachment::from_bytes(&attachment).expect("33 bytes");
+            let _ = sender.send((sample.payload().to_bytes().into_owned(), attachment));
+        });
+        Self { messages, _subscriber: subscriber.wait().unwrap() }
+    }
+
+    fn next(&self) -> (Vec<u8>, Attachment) {
+        self.messages.recv_timeout(TIMEOUT).expect("a message")
+    }
+}
+
+/// Fields of a message after its encapsulation header.
+struct Fields<'a>(CdrReader<'a, LittleEndian>);
+
+impl<'a> Fields<'a> {
+    fn of(message: &'a [u8]) -> Self {
+        assert_eq!(message[..4], [0, 1, 0, 0]);
+        Self(CdrReader::new(&message[4..]))
+    }
+
+    fn u32(&mut self) -> u32 {
+        self.0.read_u32().unwrap()
+    }
+
+    fn text(&mut self) -> String {
+        self.0.read_string().unwrap()
+    }
+
+    fn f64s<const N: usize>(&mut self) -> [f64; N] {
+        std::array::from_fn(|_| self.0.read_f64().unwrap())
+    }
+
+    fn nanos(&mut self) -> u64 {
+        let (seconds, nanos) = (self.0.read_i32().unwrap(), self.u32());
+        u64::try_from(seconds).unwrap() * 1_000_000_000 + u64::from(nanos)
+    }
+}
+
+const AT: u64 = 2_300_000_000;
+
+fn planar() -> PlanarCovariance {
+    PlanarCovariance { xx_m2: 0.25, xy_m2: 0.0, yy_m2: 0.5, yaw_rad2: 0.125 }
+}
+
+/// What a vehicle publishes at one time.
+fn publish(bus: &Bus) {
+    let publisher = |stream, options| bus.publisher(topic(stream), options).unwrap();
+    let imu = publisher(Stream::Imu, PublisherOptions::POSE);
+    imu.submit(AT, EgoMotion { speed_mps: Some(8.0), yaw_rate_rad_s: Some(0.25) });
+    let pose = publisher(Stream::Pose, PublisherOptions::POSE);
+    let world_from_cav = Pose::from_xyz_yaw([10.0, 20.0, 1.5], 0.0);
+    pose.submit(AT, PoseEstimate::Pose { world_from_cav, confidence: 0.9, covariance: Some(planar()) });
+    let lidar = publisher(Stream::Lidar, PublisherOptions::SENSOR);
+    lidar.submit(AT, Lidar { points: PointCloud { xyzi: vec![[1.0, 2.0, 3.0, 0.5]; 3] } });
+    let detections = publisher(Stream::Detections, PublisherOptions::DETECTIONS);
+    let box3d = Box3d { center_m: [5.0, 6.0, 0.5], size_m: [4.0, 2.0, 1.5], heading_rad: 0.0 };
+    detections.submit(
+        AT,
+        Detections {
+            ego: cav(),
+            agent_frame: 0,
+            method: "late".into(),
+            pose: PoseEstimate::new(world_from_cav, 0.9),
+            detections: vec![Detection { box3d, score: 0.75, source: None }],
+            fused: Vec::new(),
+            skipped: Vec::new(),
+            neighbours: Vec::new(),
+            stages: Vec::new(),
+        },
+    );
+    [imu, pose, lidar, detections].into_iter().for_each(bus::Publisher::finish);
+}
+
+/// Tokens on the network that match `selector`.
+fn tokens(session: &Session, selector: &str) -> BTreeSet<String> {
+    let replies = session.liveliness().get(selector).timeout(TIMEOUT).wait().unwrap();
+    let replies = std::iter::from_fn(|| replies.recv().ok());
+    replies.filter_map(|reply| reply.result().ok().map(|sample| sample.key_expr().to_string())).collect()
+}
+
+#[test]
+fn nodes_of_ros_see_and_hear_the_run() {
+    let (router, stop) = (TestRouter::open(), Stop::new());
+    let vehicle = router.join("agent-1000", "1000");
+    std::thread::scope(|scope| {
+        let mount = "1.5,0,2".parse().unwrap();
+        let options = NodeOptions { mount, ..NodeOptions::default() };
+        let node = start(scope, &router, (Distribution::Jazzy, options), &stop);
+        let other = other_node(&router);
+        let topics = [
+            ("clock", CLOCK, CLOCK_HASH),
+            ("tf", TF, TF_HASH),
+            ("cav_1000/pose", POSE, POSE_HASH),
+            ("cav_1000/points", POINTS, POINTS_HASH),
+            ("cav_1000/detections", DETECTIONS, DETECTIONS_HASH),
+        ];
+        let [clock, tf, pose, points, detections] =
+            topics.map(|(topic, ros_type, hash)| Subscriber::open(&other, &key(topic, ros_type, hash)));
+        let _alive = [Role::Agent, Role::Ego].map(|role| vehicle.announce(role).unwrap());
+        // Its topics appear with the vehicle, before any message.
+        let has = |kind: &str, what: &str| {
+            let found = tokens(&other, &format!("@ros2_lv/{DOMAIN}/**"));
+            found.iter().any(|token| token.contains(kind) && token.contains(what))
+        };
+        for (topic, ros_type, hash) in topics {
+            let end = format!("/%{}/{ros_type}/{hash}/", topic.replace('/', "%"));
+            wait_for(&end, || has("/MP/%/%/v2vloc/", &end));
+        }
+        assert!(has("/0/0/NN/%/%/v2vloc", ""));
+        assert!(has("/MP/", "%cav_1000%points") && has("/MP/", "/2::,5:,:,:,,") && has("/MP/", "/:1:,1:,:,:,,"));
+
+        // The node subscribes to sweeps when it knows of the subscriber: published until one has arrived.
+        let deadline = Instant::now() + TIMEOUT;
+        let (cloud, attachment) = loop {
+            assert!(Instant::now() < deadline, "no sweep");
+            publish(&vehicle);
+            if let Ok(message) = points.messages.recv_timeout(Duration::from_millis(200)) {
+                break message;
+            }
+        };
+        assert_eq!(attachment.sequence, 1);
+        assert!(tokens(&other, "@ros2_lv/**").iter().any(|token| ros2::endpoint::gid(token) == attachment.gid));
+        let mut fields = Fields::of(&cloud);
+        assert_eq!((fields.nanos(), fields.text().as_str()), (AT, "cav_1000/lidar"));
+        assert_eq!([fields.u32(), fields.u32(), fields.u32()], [1, 3, 4]);
+
+        let (message, first) = pose.next();
+        let mut fields = Fields::of(&message);
+        assert_eq!((fields.nanos(), fields.text().as_str()), (AT, "map"));
+        assert_eq!(fields.f64s(), [10.0, 20.0, 1.5, 0.0, 0.0, 0.0, 1.0]);
+        let covariance: [f64; 36] = fields.f64s();
+        assert_eq!([covariance[0], covariance[7], covariance[35]], [0.25, 0.5, 0.125]);
+        assert_eq!(first.sequence, 1);
+
+        let (message, _) = tf.next();
+        let mut fields = Fields::of(&message);
+        assert_eq!((fields.u32(), fields.nanos(), fields.text().as_str()), (1, AT, "map"));
+        assert_eq!((fields.text().as_str(), fields.f64s()), ("cav_1000/lidar", [10.0, 20.0, 1.5]));
+
+        let (message, _) = detections.next();
+        let mut fields = Fields::of(&message);
+        assert_eq!((fields.nanos(), fields.text().as_str(), fields.u32()), (AT, "cav_1000/lidar", 1));
+        assert_eq!((fields.nanos(), fields.text().as_str(), fields.u32()), (AT, "cav_1000/lidar", 1));
+        assert_eq!((fields.text().as_str(), fields.f64s()), ("vehicle", [0.75, 5.0, 6.0, 0.5]));
+
+        let (message, _) = clock.next();
+        assert_eq!(Fields::of(&message).nanos(), AT, "one time base");
+
+        // A late subscriber, as rmw_zenoh declares it, gets the fixed transforms.
+        let (sender, latched) = channel();
+        let late = other_node(&router);
+        let _late = late
+            .declare_subscriber(key("tf_static", TF, TF_HASH))
+            .history(HistoryConfig::default().detect_late_publishers().max_samples(1))
+            .subscriber_detection()
+            .callback(move |sample| {
+                assert!(Attachment::from_bytes(&sample.attachment().unwrap().to_bytes()).is_some());
+                let _ = sender.send(sample.payload().to_bytes().into_owned());
+            })
+            .wait()
+            .unwrap();
+        let message = latched.recv_timeout(TIMEOUT).unwrap();
+        let mut fields = Fields::of(&message);
+        assert_eq!((fields.u32(), fields.nanos(), fields.text().as_str()), (1, 0, "cav_1000/lidar"));
+        assert_eq!((fields.text().as_str(), fields.f64s()), ("cav_1000/base_link", [-1.5, 0.0, -2.0]));
+
+        // A vehicle that has left leaves no topics.
+        drop(_alive);
+        wait_for("a farewell", || !has("/MP/", "%cav_1000%pose"));
+        stop.request();
+        let report = node.join().unwrap();
+        assert!(report.published["/cav_1000/pose"] >= 1 && report.left_out == 0, "{report:?}");
+    });
+}
+
+/// `sensor_msgs/PointCloud2` of two points with x, y, z in single precision and intensity in 8 bits.
+fn driver_cloud(nanos: u64, point_step: u32) -> Vec<u8> {
+    let mut bytes = vec![0, 1, 0, 0];
+    let mut cdr = CdrWriter::<LittleEndian>::new(&mut bytes);
+    cdr.write_i32((nanos / 1_000_000_000) as i32);
+    cdr.write_u32((nanos % 1_000_000_000) as u32);
+    cdr.write_string("velodyne");
+    [1, 2].into_iter().for_each(|value| cdr.write_u32(value));
+    let fields = [("x", 0, 7), ("y", 4, 7), ("z", 8, 7), ("intensity", 12, 2)];
+    cdr.write_sequence_length(fields.len());
+    for (name, offset, datatype) in fields {
+        cdr.write_string(name);
+        cdr.write_u32(offset);
+        cdr.write_u8(datatype);
+        cdr.write_u32(1);
+    }
+    cdr.write_bool(false);
+    cdr.write_u32(point_step);
+    cdr.write_u32(2 * point_step);
+    let point = |x: f32| [&[x, 2.0, 3.0].map(f32::to_le_bytes).concat()[..], &[51, 0, 0, 0]].concat();
+    cdr.write_bytes(&[point(1.0), point(-1.0)].concat());
+    cdr.write_bool(true);
+    bytes
+}
+
+fn announce(session: &Session) -> LivelinessToken {
+    let zid = session.zid();
+    let token = format!("@ros2_lv/{DOMAIN}/{zid}/0/0/NN/%/%/driver");
+    session.liveliness().declare_token(token).wait().unwrap()
+}
+
+#[test]
+fn a_lidar_of_ros_is_that_of_an_agent_and_a_wrong_message_is_counted() {
+    for distribution in [Distribution::Humble, Distribution::Jazzy] {
+        let (router, stop) = (TestRouter::open(), Stop::new());
+        let agent = router.join("agent-1000", "1000");
+        let inbox = agent.inbox(4, 1);
+        let _subscription = agent.subscribe(topic(Stream::Lidar), &inbox).unwrap();
+        std::thread::scope(|scope| {
+            let lidars = ["/velodyne/points=1000", "/broken=2000"].map(|text| text.parse().unwrap()).into();
+            let options = NodeOptions { lidars, max_intensity: 255.0, ..NodeOptions::default() };
+            let node = start(scope, &router, (distribution, options), &stop);
+            let driver = other_node(&router);
+            let _node = announce(&driver);
+            wait_for("the subscriptions", || {
+                let tokens = tokens(&driver, &format!("@ros2_lv/{DOMAIN}/*/0/*/MS/**"));
+                let has = |topic: &str| tokens.iter().any(|token| token.contains(topic));
+                has("/%velodyne%points/") && has("/%broken/")
+            });
+            let hash = RosType::PointCloud2.hash(distribution);
+            let put = |topic: &str, cloud: Vec<u8>| {
+                let attachment = Attachment { sequence: 1, source_nanos: 1, gid: [7; 16] };
+                driver.put(key(topic, POINTS, &hash), cloud).attachment(attachment.to_bytes()).wait().unwrap();
+            };
+            put("broken", driver_cloud(AT, 12));
+            let mut sent = 0;
+            let arrival = loop {
+                sent += 1;
+                put("velodyne/points", driver_cloud(AT + sent, 16));
+                match inbox.take(Some(Instant::now() + Duration::from_millis(100))) {
+                    Pop::Item(_, Event::Message(arrival)) => break arrival,
+                    Pop::Item(..) | Pop::TimedOut => assert!(sent < 600, "nothing arrives"),
+                    Pop::Closed => panic!("the inbox is closed"),
+                }
+            };
+            let capture = arrival.header.stamp.capture_nanos;
+            assert!((AT + 1..=AT + sent).contains(&capture), "{capture}");
+            let lidar: Lidar = inbox.decode(&arrival, &Limits::DEFAULT).unwrap();
+            assert_eq!(lidar.points.xyzi, [[1.0, 2.0, 3.0, 0.2], [-1.0, 2.0, 3.0, 0.2]]);
+            stop.request();
+            let report = node.join().unwrap().lidar;
+            assert_eq!((report.unreadable, report.is_complete()), (1, false), "{report:?}");
+            assert!(report.sweeps >= 1, "{report:?}");
+            // The agent is told that nothing follows.
+            while !matches!(next_event(&inbox), (_, Event::End { .. })) {}
+        });
+    }
+}
