@@ -23,7 +23,6 @@ pub(crate) fn header(cdr: &mut Cdr<'_>, nanos: u64, frame_id: &str) {
 }
 
 /// `builtin_interfaces/Time`.
-#[expect(clippy::cast_possible_truncation, reason = "less than 10^9")]
 pub(crate) fn time(cdr: &mut Cdr<'_>, nanos: u64) {
     // Seconds beyond 2038 do not fit into the message.
     cdr.write_i32(i32::try_from(nanos / 1_000_000_000).unwrap_or(i32::MAX));

@@ -48,6 +48,16 @@ pub(crate) const POINT_CLOUD_2: Definition = (
 pub(crate) const COMPRESSED_IMAGE: Definition =
     ("sensor_msgs/CompressedImage", "std_msgs/Header header\nstring format\nuint8[] data\n");
 
+pub(crate) const REGION_OF_INTEREST: Definition = (
+    "sensor_msgs/RegionOfInterest",
+    "uint32 x_offset\nuint32 y_offset\nuint32 height\nuint32 width\nbool do_rectify\n",
+);
+pub(crate) const CAMERA_INFO: Definition = (
+    "sensor_msgs/CameraInfo",
+    "std_msgs/Header header\nuint32 height\nuint32 width\nstring distortion_model\nfloat64[] d\nfloat64[9] k\n\
+     float64[9] r\nfloat64[12] p\nuint32 binning_x\nuint32 binning_y\nsensor_msgs/RegionOfInterest roi\n",
+);
+
 pub(crate) const UV_COORDINATE: Definition = ("visualization_msgs/UVCoordinate", "float32 u\nfloat32 v\n");
 pub(crate) const MESH_FILE: Definition = ("visualization_msgs/MeshFile", "string filename\nuint8[] data\n");
 pub(crate) const MARKER: Definition = (

@@ -90,6 +90,12 @@ pub fn lidar_frame(cav: &CavId) -> String {
     format!("{}/lidar", vehicle(cav))
 }
 
+/// Optical frame of a vehicle's camera: z ahead, x right, y down.
+#[must_use]
+pub fn camera_frame(cav: &CavId, number: u8) -> String {
+    format!("{}/camera_{number}", vehicle(cav))
+}
+
 /// Frame of a vehicle's body, fixed to its LiDAR.
 #[must_use]
 pub fn base_frame(cav: &CavId) -> String {

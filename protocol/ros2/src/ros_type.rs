@@ -7,8 +7,12 @@ use super::type_hash::{Distribution, type_hash};
 /// A ROS 2 type that this program writes or reads.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum RosType {
+    /// `sensor_msgs/msg/CameraInfo`.
+    CameraInfo,
     /// `rosgraph_msgs/msg/Clock`.
     Clock,
+    /// `sensor_msgs/msg/CompressedImage`.
+    CompressedImage,
     /// `vision_msgs/msg/Detection3DArray`.
     Detection3dArray,
     /// `diagnostic_msgs/msg/DiagnosticArray`.
@@ -27,8 +31,10 @@ pub enum RosType {
 
 impl RosType {
     /// Every type.
-    pub const ALL: [Self; 8] = [
+    pub const ALL: [Self; 10] = [
+        Self::CameraInfo,
         Self::Clock,
+        Self::CompressedImage,
         Self::Detection3dArray,
         Self::DiagnosticArray,
         Self::MarkerArray,
@@ -83,7 +89,9 @@ impl RosType {
     /// Own definition, and those of all contained types.
     fn definitions(self) -> (&'static Definition, &'static [Definition]) {
         match self {
+            Self::CameraInfo => (&of::CAMERA_INFO, &[of::HEADER, of::TIME, of::REGION_OF_INTEREST]),
             Self::Clock => (&of::CLOCK, &[of::TIME]),
+            Self::CompressedImage => (&of::COMPRESSED_IMAGE, &[of::HEADER, of::TIME]),
             Self::Detection3dArray => (
                 &of::DETECTION_3D_ARRAY,
                 &[
@@ -176,7 +184,9 @@ mod tests {
     #[test]
     fn hashes_are_those_of_the_distributions() {
         let known = [
+            (RosType::CameraInfo, "b3dfd68ff46c9d56c80fd3bd4ed22c7a4ddce8c8348f2f59c299e73118e7e275"),
             (RosType::Clock, "692f7a66e93a3c83e71765d033b60349ba68023a8c689a79e48078bcb5c58564"),
+            (RosType::CompressedImage, "15640771531571185e2efc8a100baf923961a4e15d5569652e6cb6691e8e371a"),
             (RosType::Detection3dArray, "793f5eab9595ac1c0da07873cc859db42eae51f0ee76056db8562515d830e018"),
             (RosType::DiagnosticArray, "5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e"),
             (RosType::MarkerArray, "86cb8800b6fb05b5eff1abd7a56f62a5641d3ae9a1c29e78e67e704f1d067dcf"),

@@ -15,6 +15,10 @@ pub enum VehicleTopic {
     Odometry,
     /// LiDAR sweeps.
     Points,
+    /// Encoded images of a camera.
+    Image(u8),
+    /// Projection of a camera.
+    CameraInfo(u8),
     /// Detections of an ego.
     Detections,
     /// The same, for viewers.
@@ -58,6 +62,8 @@ impl RosTopic {
             VehicleTopic::Pose => "pose",
             VehicleTopic::Odometry => "odometry",
             VehicleTopic::Points => "points",
+            VehicleTopic::Image(number) => &format!("camera_{number}/image/compressed"),
+            VehicleTopic::CameraInfo(number) => &format!("camera_{number}/camera_info"),
             VehicleTopic::Detections => "detections",
             VehicleTopic::Markers => "markers",
         };
@@ -71,6 +77,8 @@ impl RosTopic {
             Self::Vehicle(_, VehicleTopic::Pose) | Self::InitialPose => RosType::PoseWithCovarianceStamped,
             Self::Vehicle(_, VehicleTopic::Odometry) => RosType::Odometry,
             Self::Vehicle(_, VehicleTopic::Points) => RosType::PointCloud2,
+            Self::Vehicle(_, VehicleTopic::Image(_)) => RosType::CompressedImage,
+            Self::Vehicle(_, VehicleTopic::CameraInfo(_)) => RosType::CameraInfo,
             Self::Vehicle(_, VehicleTopic::Detections) => RosType::Detection3dArray,
             Self::Vehicle(_, VehicleTopic::Markers) | Self::Truth => RosType::MarkerArray,
             Self::Tf | Self::TfStatic => RosType::TfMessage,
@@ -83,7 +91,9 @@ impl RosTopic {
     #[must_use]
     pub fn qos(&self) -> Qos {
         match self {
-            Self::Vehicle(_, VehicleTopic::Points) => Qos::SENSOR_DATA,
+            Self::Vehicle(_, VehicleTopic::Points | VehicleTopic::Image(_) | VehicleTopic::CameraInfo(_)) => {
+                Qos::SENSOR_DATA
+            }
             Self::Tf => Qos::TF,
             Self::TfStatic => Qos::TF_STATIC,
             Self::Clock => Qos::CLOCK,

@@ -2,10 +2,10 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use protocol::{CavId, EgoMotion, Message, PoseEstimate, ProcessId, RunId, Stats, Stream, Topic, Truth};
+use protocol::{Camera, CavId, EgoMotion, Message, PoseEstimate, ProcessId, RunId, Stats, Stream, Topic, Truth};
 
 use super::encode::{self, Level, Marked, Status};
-use super::names::{MAP_FRAME, lidar_frame, truth_frame};
+use super::names::{MAP_FRAME, camera_frame, lidar_frame, truth_frame};
 use super::topic::{RosTopic, VehicleTopic};
 
 const DETECTION_RGB: [f32; 3] = [1.0, 0.37, 0.30];
@@ -44,6 +44,7 @@ impl Translator {
         let streams = [Stream::Lidar, Stream::Imu, Stream::Pose, Stream::Detections];
         match topic {
             Topic::Truth | Topic::Stats(_) => true,
+            Topic::Stream { stream: Stream::Camera(_), .. } => true,
             Topic::Stream { stream, .. } => streams.contains(stream),
             _ => false,
         }
@@ -59,6 +60,9 @@ impl Translator {
             (Topic::Stream { cav, stream: Stream::Lidar }, Message::Lidar(lidar)) => {
                 let cdr = encode::point_cloud(at, &lidar_frame(cav), &lidar.points);
                 vec![of_vehicle(cav, VehicleTopic::Points, cdr)]
+            }
+            (Topic::Stream { cav, stream: Stream::Camera(number) }, Message::Camera(image)) => {
+                image_messages(cav, *number, at, image)
             }
             (Topic::Stream { cav, stream: Stream::Imu }, Message::Imu(motion)) => {
                 self.motions.insert(cav.clone(), (at, *motion));
@@ -129,6 +133,20 @@ fn of_vehicle(cav: &CavId, topic: VehicleTopic, cdr: Vec<u8>) -> RosMessage {
     RosMessage { topic: RosTopic::Vehicle(cav.clone(), topic), cdr }
 }
 
+/// An image, and the calibration that is known of its camera: projection and place on the vehicle.
+fn image_messages(cav: &CavId, number: u8, at: u64, image: &Camera) -> Vec<RosMessage> {
+    let (frame, metadata) = (camera_frame(cav, number), &image.metadata);
+    let place = metadata
+        .lidar_from_camera
+        .map(|pose| RosMessage { topic: RosTopic::Tf, cdr: encode::mounted(at, &lidar_frame(cav), &frame, &pose) });
+    let info = metadata.pinhole.map(|pinhole| {
+        let cdr = encode::camera_info(at, &frame, metadata, &pinhole);
+        of_vehicle(cav, VehicleTopic::CameraInfo(number), cdr)
+    });
+    let encoded = of_vehicle(cav, VehicleTopic::Image(number), encode::compressed_image(at, &frame, image));
+    place.into_iter().chain(info).chain([encoded]).collect()
+}
+
 fn truth_messages(at: u64, truth: &Truth) -> Vec<RosMessage> {
     let mut seen = BTreeSet::new();
     let objects = truth.agents.iter().flat_map(|agent| &agent.objects).filter(|object| seen.insert(object.id));
@@ -142,7 +160,9 @@ fn truth_messages(at: u64, truth: &Truth) -> Vec<RosMessage> {
 
 #[cfg(test)]
 mod tests {
-    use protocol::{Account, DropReason, Ledger, NoPoseReason, Pose, ProcessUsage};
+    use protocol::{
+        Account, CameraMetadata, DropReason, ImageFormat, Ledger, NoPoseReason, Pinhole, Pose, ProcessUsage,
+    };
 
     use super::*;
 
@@ -191,6 +211,26 @@ mod tests {
         let messages = translator.translate(&Topic::Stats(process), 0, &message);
         let has = |text: &[u8]| messages[0].cdr.windows(text.len()).any(|bytes| bytes == text);
         assert!(has(b"v2vloc: agent-1\0") && has(b"dropped: superseded\0") && has(b"test\0"));
+    }
+
+    #[test]
+    fn an_image_brings_the_place_and_the_projection_of_its_camera() {
+        let metadata = CameraMetadata {
+            format: ImageFormat::Png,
+            width_px: 8,
+            height_px: 4,
+            pinhole: Some(Pinhole { fx_px: 4.0, fy_px: 5.0, cx_px: 6.0, cy_px: 7.0 }),
+            lidar_from_camera: Some(Pose::IDENTITY),
+        };
+        let mut camera = Camera { metadata, image: vec![1, 2, 3] };
+        let names = |camera: &Camera| {
+            let messages = translator().translate(&topic(Stream::Camera(2)), 5, &Message::Camera(camera.clone()));
+            messages.iter().map(|message| message.topic.name(None).to_string()).collect::<Vec<_>>()
+        };
+        assert_eq!(names(&camera), ["/tf", "/cav_1/camera_2/camera_info", "/cav_1/camera_2/image/compressed"]);
+        (camera.metadata.pinhole, camera.metadata.lidar_from_camera) = (None, None);
+        assert_eq!(names(&camera), ["/cav_1/camera_2/image/compressed"]);
+        assert!(Translator::wants(&topic(Stream::Camera(0))));
     }
 
     #[test]

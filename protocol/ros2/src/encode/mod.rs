@@ -1,14 +1,16 @@
 //! Messages of ROS 2 written in CDR.
 
 mod boxes;
+mod camera;
 mod diagnostics;
 mod motion;
 mod mount;
 mod sweep;
 
 pub(crate) use boxes::{Marked, detections, markers, truth_marker};
+pub(crate) use camera::{camera_info, compressed_image};
 pub(crate) use diagnostics::{Level, Status, diagnostics};
 pub use motion::{clock, pose, static_transforms};
-pub(crate) use motion::{odometry, transforms};
+pub(crate) use motion::{mounted, odometry, transforms};
 pub use mount::{Mount, MountError};
 pub(crate) use sweep::point_cloud;

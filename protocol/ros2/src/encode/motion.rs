@@ -75,6 +75,11 @@ pub(crate) fn transforms(nanos: u64, children: &[(String, Pose)]) -> Vec<u8> {
     tf_message(nanos, children.iter().map(|(child, pose)| (MAP_FRAME.to_owned(), child.clone(), *pose)))
 }
 
+/// `tf2_msgs/TFMessage`: one frame mounted on another, with `parent_from_child`.
+pub(crate) fn mounted(nanos: u64, parent: &str, child: &str, parent_from_child: &Pose) -> Vec<u8> {
+    tf_message(nanos, [(parent.to_owned(), child.to_owned(), *parent_from_child)].into_iter())
+}
+
 /// `tf2_msgs/TFMessage` for `/tf_static`: the bodies of vehicles, fixed to their LiDARs. The LiDAR is the parent, as its
 /// pose is the one that is estimated.
 #[must_use]

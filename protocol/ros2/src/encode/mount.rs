@@ -41,10 +41,12 @@ impl FromStr for Mount {
             Some(&[x, y, z, yaw_deg]) => ([x, y, z], yaw_deg),
             _ => return Err(MountError { text: text.chars().take(100).collect() }),
         };
-        if xyz.iter().any(|value| !(value.abs() <= MAX_M)) || !(yaw_deg.abs() <= 360.0) {
-            return Err(MountError { text: text.chars().take(100).collect() });
+        // A number that is none is in no range.
+        let is_place = xyz.iter().all(|value| value.abs() <= MAX_M) && yaw_deg.abs() <= 360.0;
+        match is_place {
+            true => Ok(Self { base_from_lidar: Pose::from_xyz_yaw(xyz, yaw_deg.to_radians()) }),
+            false => Err(MountError { text: text.chars().take(100).collect() }),
         }
-        Ok(Self { base_from_lidar: Pose::from_xyz_yaw(xyz, yaw_deg.to_radians()) })
     }
 }
 
