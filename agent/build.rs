@@ -1,5 +1,6 @@
 //! Build script: writes the path of libtorch into the run path of every binary, test and benchmark of a package that
-//! names this file as its build script, so that none of them needs LD_LIBRARY_PATH.
+//! names this file as its build script, so that none of them needs LD_LIBRARY_PATH. Before it comes the folder `lib` beside
+//! that of the programs, where `deploy/install` puts the libraries.
 
 use std::env;
 
@@ -10,6 +11,7 @@ fn main() {
     let Ok(lib_dir) = env::var("DEP_TCH_LIBTORCH_LIB") else {
         return;
     };
+    println!("cargo:rustc-link-arg=-Wl,-rpath,$ORIGIN/../lib");
     let lib_dir = std::path::absolute(&lib_dir).map_or(lib_dir, |path| path.display().to_string());
     println!("cargo:rustc-link-arg=-Wl,-rpath,{lib_dir}");
 }

@@ -33,6 +33,10 @@ enum Command {
     Eval(Forwarded),
     /// Localize recorded sweeps and write their poses to a table
     Localize(Forwarded),
+    /// Find the pose of single point clouds
+    Locate(Forwarded),
+    /// Make a head for a place from drives through it
+    Map(Forwarded),
     /// Prepare a scene head for 8-bit inference
     Quantise(Forwarded),
     /// Train the networks of the localization
@@ -49,6 +53,8 @@ impl Command {
             }
             Self::Eval(forwarded) => Ok(offline(forwarded, "eval")?),
             Self::Localize(forwarded) => Ok(offline(forwarded, "localize")?),
+            Self::Locate(forwarded) => Ok(offline(forwarded, "locate")?),
+            Self::Map(forwarded) => Ok(offline(forwarded, "map")?),
             Self::Quantise(forwarded) => Ok(offline(forwarded, "quantise")?),
             Self::Train(forwarded) => Ok(offline(forwarded, "train")?),
         }

@@ -6,6 +6,7 @@
 //! - [`registration`]: pose from correspondences (Kabsch, RANSAC, SC2-PCR) and ICP.
 //! - [`pose_source`]: origins of a vehicle's pose: recorded, noisy, estimated by one of the above.
 //! - [`tracker`]: the pose from sweep to sweep, with its covariance.
+//! - [`pose_covariance`]: covariance of the pose of one sweep.
 //! - [`pose_error`], [`statistics`]: measures of their accuracy.
 //!
 //! ```
@@ -34,6 +35,7 @@
 
 pub mod competitors;
 pub mod pgc;
+pub mod pose_covariance;
 pub mod pose_error;
 pub mod pose_source;
 pub mod registration;

@@ -26,6 +26,8 @@ pub(crate) struct Cli {
 enum Command {
     Eval(command::eval::Args),
     Localize(command::localize::Args),
+    Locate(command::locate::Args),
+    Map(command::map::Args),
     Quantise(command::quantise::Args),
     Train(command::train::Args),
 }
@@ -36,6 +38,8 @@ pub(crate) fn run(cli: Cli) -> ExitCode {
     let outcome = kept.and_then(|()| match cli.command {
         Command::Eval(args) => command::eval::run(&args),
         Command::Localize(args) => command::localize::run(&args),
+        Command::Locate(args) => command::locate::run(&args),
+        Command::Map(args) => command::map::run(&args),
         Command::Quantise(args) => command::quantise::run(&args),
         Command::Train(args) => command::train::run(&args).map(|()| Outcome::Done),
     });

@@ -141,6 +141,9 @@ impl Arguments {
                 }
             }
         }
+        if let Some((metrics, dataset)) = all.first().zip(self.dataset.as_deref()) {
+            report::print_unlocated(metrics, &self.pose.0, dataset);
+        }
         Ok(left_out(all.iter().map(|metrics| &metrics.left_out)))
     }
 

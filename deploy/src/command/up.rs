@@ -68,6 +68,9 @@ impl Arguments {
         } else {
             output::text(report::run_table(&result))?;
         }
+        if let Some(pose) = scenario.poses().first() {
+            report::print_unlocated(&result.metrics, pose, &scenario.scene.dir);
+        }
         report::print_loss(&result, false);
         Ok(Outcome::of(result.lost_data()))
     }

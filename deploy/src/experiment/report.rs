@@ -1,9 +1,12 @@
 //! Results as tables for a terminal.
 
 use std::fmt::Write as _;
+use std::path::Path;
 
 use fusion::Exchange;
 use fusion::Method;
+use localization::pgc::wrong_place::wrong_place_hint;
+use localization::pose_source::PoseSourceConfig;
 use support::output;
 use support::text_table::{Side, TextTable};
 
@@ -29,6 +32,20 @@ pub fn print_loss(result: &RunResult, with_method: bool) {
     if let Some(sentence) = loss::sentence(result) {
         let method = if with_method { format!("{}: ", result.metrics.method) } else { String::new() };
         output::note(format_args!("exit 3: {method}{sentence}"));
+    }
+}
+
+/// Prints a hint if no sweep was localized: the head may be of another place. `scene`: folder of the data set.
+pub fn print_unlocated(metrics: &Metrics, pose: &PoseSourceConfig, scene: &Path) {
+    let head = match pose {
+        PoseSourceConfig::Pgc(pgc) => &pgc.head,
+        PoseSourceConfig::Tracked(tracked) => &tracked.head,
+        _ => return,
+    };
+    if metrics.pose.mean_m.is_none() && metrics.pose.no_pose > 0 {
+        let scenarios = dataset::open(scene).map(|dataset| dataset.scenarios).unwrap_or_default();
+        let map = scenarios.first().and_then(|scenario| scenario.generated_map().ok()).map(|map| map.to_string());
+        output::note(wrong_place_hint(metrics.pose.no_pose, head, map.as_deref()));
     }
 }
 

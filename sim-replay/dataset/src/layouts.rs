@@ -8,8 +8,8 @@ use std::path::Path;
 use serde::{Serialize, Serializer};
 
 use crate::{
-    Dataset, OpenOptions, ReadError, Scenario, dair, kitti_object, kitti_odometry, localization, nuscenes,
-    opv2v_family, recorded,
+    Dataset, OpenOptions, ReadError, Scenario, cloud_sequence, dair, kitti_object, kitti_odometry, localization,
+    nuscenes, opv2v_family, recorded,
 };
 
 /// A layout of files on disk: its row of the table.
@@ -48,7 +48,7 @@ pub(crate) enum Reader {
 }
 
 /// All layouts, in the order in which they are tried on a folder: data sets before sequences.
-pub static LAYOUTS: [&LayoutRow; 13] = [
+pub static LAYOUTS: [&LayoutRow; 14] = [
     &recorded::RECORDING,
     &dair::DAIR,
     &dair::V2XSEQ,
@@ -62,6 +62,7 @@ pub static LAYOUTS: [&LayoutRow; 13] = [
     &kitti_odometry::KITTI_ODOMETRY,
     &localization::NCLT,
     &localization::OXFORD,
+    &cloud_sequence::CLOUDS,
 ];
 
 impl Layout {

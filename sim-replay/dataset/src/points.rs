@@ -18,7 +18,7 @@ pub use plausibility::Plausibility;
 
 use floats::FloatForm;
 
-use super::{OpenOptions, ReadError, files};
+use super::{OpenOptions, ReadError, files, npy, ply};
 use crate::pcd::{self, IntensityKind, IntensityOrigin, PcdCloud};
 
 /// Largest point file that is read, bytes: a sweep of a 128-channel LiDAR has some 10 MB.
@@ -29,7 +29,8 @@ const SAMPLES: usize = 3;
 /// Storage of the points of a file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(super) enum SweepStorage {
-    /// By its name: `.pcd` is PCD, all else (`.bin`, `.pcd.bin`) little-endian `f32`, 4 or 5 per point.
+    /// By its name: `.pcd` is PCD, `.ply` PLY, `.npy` a NumPy array, all else (`.bin`, `.pcd.bin`) little-endian `f32`, 4
+    /// or 5 per point.
     #[default]
     ByName,
     /// Little-endian `f32`, 5 per point: x, y, z, intensity, ring (nuScenes).
@@ -125,7 +126,7 @@ impl AgentSweeps {
     /// Number of floats per point.
     fn form(&self, path: &Path) -> Result<FloatForm, ReadError> {
         let form = self.form.get_or_init(|| {
-            let files = self.files.iter().filter(|path| !is_pcd(path));
+            let files = self.files.iter().filter(|path| !FileKind::of(path).is_described());
             let samples = files.filter_map(|path| files::read_limited(path, MAX_BYTES).ok());
             FloatForm::of(&samples.filter(|bytes| !bytes.is_empty()).take(SAMPLES).collect::<Vec<_>>())
         });
@@ -135,8 +136,12 @@ impl AgentSweeps {
     /// Reads a sweep with the intensities as stored.
     fn read_stored(&self, storage: SweepStorage, path: &Path) -> Result<PcdCloud, ReadError> {
         match storage {
-            SweepStorage::ByName if is_pcd(path) => read_pcd_stored(path),
-            SweepStorage::ByName => read_floats(path, self.form(path)?),
+            SweepStorage::ByName => match FileKind::of(path) {
+                FileKind::Pcd => read_pcd_stored(path),
+                FileKind::Ply => read_described(path, ply::decode),
+                FileKind::Npy => read_described(path, npy::decode),
+                FileKind::Floats => read_floats(path, self.form(path)?),
+            },
             SweepStorage::FiveFloats => read_floats(path, FloatForm::Five),
             SweepStorage::Planar => read_planar(path),
             SweepStorage::NcltRaw => read_nclt_raw(path),
@@ -150,8 +155,35 @@ fn read_floats(path: &Path, form: FloatForm) -> Result<PcdCloud, ReadError> {
     Ok(form.points(&bytes))
 }
 
-fn is_pcd(path: &Path) -> bool {
-    path.extension().is_some_and(|kind| kind.eq_ignore_ascii_case("pcd"))
+/// Format of a file, by the ending of its name.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum FileKind {
+    Pcd,
+    Ply,
+    Npy,
+    Floats,
+}
+
+impl FileKind {
+    fn of(path: &Path) -> Self {
+        let ending = path.extension().and_then(|ending| ending.to_str()).unwrap_or_default();
+        match ending.to_ascii_lowercase().as_str() {
+            "pcd" => Self::Pcd,
+            "ply" => Self::Ply,
+            "npy" => Self::Npy,
+            _ => Self::Floats,
+        }
+    }
+
+    /// True for formats that record the type of their numbers.
+    fn is_described(self) -> bool {
+        self != Self::Floats
+    }
+}
+
+fn read_described(path: &Path, decode: fn(&[u8]) -> Result<PcdCloud, String>) -> Result<PcdCloud, ReadError> {
+    let bytes = files::read_limited(path, MAX_BYTES)?;
+    decode(&bytes).map_err(|reason| ReadError::malformed(path, reason))
 }
 
 /// Reads a PCD file that is no LiDAR sweep: the fourth value is as stored, or the red byte of a colour from 0 to 1.

@@ -3,6 +3,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use dataset::cloud_files::clouds_at;
 use dataset::pcd;
 use dataset::{self, LoadOptions, Tick};
 use deploy::experiment::sweep::Experiment;
@@ -65,6 +66,8 @@ pub fn all(root: &Path) -> Vec<Reader> {
         in_memory("ros2 cloud", vec![seeds::ros2_cloud()], |_, bytes| {
             read_point_cloud(bytes, SweepLimits { max_points: 1 << 20, max_abs_value: 1e6 }).is_ok()
         }),
+        on_disk("ply", vec![seeds::PLY.as_bytes().to_vec()], file("ply", "a.ply"), read_cloud),
+        on_disk("npy", vec![seeds::npy()], file("npy", "a.npy"), read_cloud),
         in_memory("opendrive", text(seeds::OPENDRIVE), |_, bytes| map::opendrive::read_bytes(bytes).is_ok()),
         on_disk("mcap recording", vec![seeds::recording(root)], file("mcap", "a.mcap"), read_recording),
         on_disk("scenario", text(seeds::SCENARIO), file("scenario", "a.yaml"), |path, _| {
@@ -93,6 +96,11 @@ pub fn all(root: &Path) -> Vec<Reader> {
     all.extend(frames(root));
     all.extend(drives(root));
     all
+}
+
+/// A single cloud.
+fn read_cloud(path: &Path, _: &[u8]) -> bool {
+    clouds_at(&[path.to_owned()]).into_iter().flatten().all(|file| file.read().is_ok())
 }
 
 /// Checkpoint of a replay, and the ticks that follow from it.
@@ -140,6 +148,8 @@ fn drives(root: &Path) -> Vec<Reader> {
             b"1326030975000000,1,2,3,0.1,0.2,0.3\n1326030975726043,1,2,3,0.1,0.2,0.3\n1326030976000000,1.5,2,3,0.1,0.2,0.3\n",
         ),
     ];
+    let clouds: [(&str, &[u8]); 2] =
+        [("clouds/1.5.bin", &points), ("poses.txt", b"# time x y z q\n1.5 1 2 3 0 0 0.6 0.8\n")];
     let h5 = sequences::hdf5(
         &(0..12).map(|sweep| 1_000_000 + 100_000 * sweep).collect::<Vec<_>>(),
         &[[1.0, 0.0, 0.0, 5.0, 0.0, 1.0, 0.0, 6.0, 0.0, 0.0, 1.0, 0.0]; 12],
@@ -157,6 +167,7 @@ fn drives(root: &Path) -> Vec<Reader> {
         ),
         (root.join("object/training"), &object[..], &["kitti object points", "kitti object calib", "kitti labels"][..]),
         (root.join("raw/2012-01-22"), &nclt[..], &["nclt raw points", "nclt ground truth"][..]),
+        (root.join("clouds/drive"), &clouds[..], &["", "cloud poses"][..]),
         (root.join("nclt/2012-01-22"), &with_poses[5..], &["", "", "", "", "", "", "", "nclt poses hdf5"][..]),
         (root.join("oxford").join(oxford), &with_poses[5..], &["oxford points", "", "", "", "", "", "", ""][..]),
     ]

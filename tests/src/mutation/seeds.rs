@@ -36,6 +36,21 @@ pub fn clouds() -> Vec<Vec<u8>> {
     files
 }
 
+/// Points in ASCII, with an element before them that is skipped.
+pub const PLY: &str = "ply\nformat ascii 1.0\ncomment seed\nelement sensor 1\nproperty float height\nelement vertex 2\n\
+    property double x\nproperty float y\nproperty float z\nproperty uchar intensity\nend_header\n1.7\n1 2 3 40\n4 5 -1 2\n";
+
+/// Two points as an array.
+pub fn npy() -> Vec<u8> {
+    let header = "{'descr': '<f4', 'fortran_order': False, 'shape': (2, 4), }\n";
+    let numbers = (1..9_u8).flat_map(|number| f32::from(number).to_le_bytes());
+    [b"\x93NUMPY\x01\x00", &[header.len() as u8, 0][..], header.as_bytes()]
+        .concat()
+        .into_iter()
+        .chain(numbers)
+        .collect()
+}
+
 /// Three points with the padding of a message, some of it of no bytes, and more bytes after them than stated.
 fn padded() -> Vec<u8> {
     let mut file = b"# .PCD v0.7\nVERSION .7\nFIELDS x y z _ intensity _ ring _\nSIZE 4 4 4 1 1 1 2 1\n\

@@ -16,6 +16,7 @@ use super::pose_evidence::PoseEvidence;
 use super::pose_refinement::{self, SweepCells};
 use super::pose_search::{PoseSearch, SearchTimes};
 use super::pose_solver::{self, FoundPose, PoseSolver, Solved};
+use super::pose_std::PoseStd;
 use super::scene_encoder::{SceneEncoder, SceneFeatures};
 use super::scene_regression::SceneHead;
 use super::voxel_batch::VoxelBatch;
@@ -382,8 +383,8 @@ impl Localization {
         let (found, inlier_count) = match estimate {
             PoseEstimate::Pose { world_from_cav, confidence, .. } => {
                 let (world_from_sensor, sigma) = (world_from_cav.isometry(), f64::from(confidence));
-                let evidence = PoseEvidence::none();
-                (Some(FoundPose { world_from_sensor, evidence, sigma, is_rejected: false }), 0)
+                let (evidence, cell_covariance) = (PoseEvidence::none(), PoseStd::UNBOUNDED.covariance);
+                (Some(FoundPose { world_from_sensor, evidence, cell_covariance, sigma, is_rejected: false }), 0)
             }
             PoseEstimate::NoPose { inlier_count, .. } => (None, inlier_count),
         };

@@ -25,6 +25,7 @@ pub(crate) mod scene_regression;
 pub mod synthetic;
 pub(crate) mod voxel_batch;
 pub(crate) mod voxelise;
+pub mod wrong_place;
 
 pub use encoder_config::{SceneEncoderConfig, VoxelInput};
 pub use error::LocalizerError;

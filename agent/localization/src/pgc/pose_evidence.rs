@@ -63,7 +63,7 @@ impl PoseEvidence {
         registration: &Registration,
         second: Option<&RefinedPose>,
     ) -> Self {
-        let std = second.map_or_else(|| first_std(coordinates, registration), |second| second.std);
+        let std = std_of(coordinates, registration, second);
         Self {
             cells: coordinates.sensor_m.len(),
             inliers: registration.inliers.len(),
@@ -150,6 +150,15 @@ fn median(epsilon_m: &[f32]) -> f64 {
     let mut sorted = epsilon_m.to_vec();
     let middle = sorted.len() / 2;
     if sorted.is_empty() { 0.0 } else { f64::from(*sorted.select_nth_unstable_by(middle, f32::total_cmp).1) }
+}
+
+/// Standard deviations of a pose: of the refined one, if there is one.
+pub(super) fn std_of(
+    coordinates: &SceneCoordinates,
+    registration: &Registration,
+    second: Option<&RefinedPose>,
+) -> PoseStd {
+    second.map_or_else(|| first_std(coordinates, registration), |second| second.std)
 }
 
 /// Standard deviation of a coarse pose: its inliers are weighted by their confidences.

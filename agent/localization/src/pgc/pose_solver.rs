@@ -5,7 +5,7 @@ use protocol::{NoPoseReason, PoseEstimate};
 
 use super::confidence::Confidence;
 use super::localize::SceneCoordinates;
-use super::pose_evidence::PoseEvidence;
+use super::pose_evidence::{PoseEvidence, std_of};
 use super::pose_refinement::RefinedPose;
 use crate::registration::ransac::{self, RansacConfig};
 use crate::registration::sc2pcr::{self, Sc2PcrConfig};
@@ -45,6 +45,10 @@ pub struct FoundPose {
     pub world_from_sensor: Isometry3<f64>,
     /// Evidence for the pose.
     pub evidence: PoseEvidence,
+    /// Covariance of position (metres) and rotation about the axes of the world (radians) from the residuals of the
+    /// cells alone: its shape is right, but errors of neighbouring cells are correlated, so it is too small
+    /// ([`crate::pose_covariance`]).
+    pub cell_covariance: [[f64; 6]; 6],
     /// Confidence, 0..=1.
     pub sigma: f64,
     /// True if the confidence is below the threshold: the pose is not published.
@@ -105,7 +109,9 @@ impl PoseSolver {
         let last = second.map_or(registration, |second| &second.registration);
         let mut world_from_sensor = last.target_from_source;
         world_from_sensor.translation.vector += Vector3::from(coordinates.origin_m);
-        FoundPose { world_from_sensor, evidence, sigma, is_rejected: self.confidence.rejects(sigma) }
+        let cell_covariance = std_of(coordinates, registration, second).covariance;
+        let is_rejected = self.confidence.rejects(sigma);
+        FoundPose { world_from_sensor, evidence, cell_covariance, sigma, is_rejected }
     }
 }
 
@@ -127,6 +133,7 @@ pub(super) fn confirm(refined: &RefinedPose, start: &Isometry3<f64>, origin_m: &
         FoundPose {
             world_from_sensor,
             evidence: PoseEvidence::of_refinement(refined, start),
+            cell_covariance: refined.std.covariance,
             sigma: 1.0 / (1.0 + error_m * error_m),
             is_rejected: false,
         }

@@ -13,11 +13,14 @@ pub(super) struct PoseStd {
     pub(super) worst_axis_m: f64,
     /// Standard deviation of the orientation, all axes together, radians.
     pub(super) rotation_rad: f64,
+    /// Covariance of position (metres) and rotation about the axes of the world (radians), in this order.
+    pub(super) covariance: [[f64; 6]; 6],
 }
 
 impl PoseStd {
     /// Value for cells that do not constrain the pose.
-    pub(super) const UNBOUNDED: Self = Self { position_m: 1e3, worst_axis_m: 1e3, rotation_rad: 1e3 };
+    pub(super) const UNBOUNDED: Self =
+        Self { position_m: 1e3, worst_axis_m: 1e3, rotation_rad: 1e3, covariance: diagonal(1e6) };
 
     /// Standard deviations of the weighted fit of `target_from_source` to pairs, each with its weight there.
     ///
@@ -58,8 +61,23 @@ impl PoseStd {
             position_m: bounded(variance(0), Self::UNBOUNDED.position_m),
             worst_axis_m: bounded(worst_axis, Self::UNBOUNDED.worst_axis_m),
             rotation_rad: bounded(variance(3), Self::UNBOUNDED.rotation_rad),
+            covariance: match covariance.iter().all(|entry| entry.is_finite()) {
+                true => std::array::from_fn(|row| std::array::from_fn(|column| covariance[(row, column)])),
+                false => Self::UNBOUNDED.covariance,
+            },
         }
     }
+}
+
+/// A matrix with the same value along its diagonal.
+const fn diagonal(value: f64) -> [[f64; 6]; 6] {
+    let mut matrix = [[0.0; 6]; 6];
+    let mut row = 0;
+    while row < 6 {
+        matrix[row][row] = value;
+        row += 1;
+    }
+    matrix
 }
 
 #[cfg(test)]

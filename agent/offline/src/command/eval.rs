@@ -11,10 +11,11 @@ use agent_offline::icp_map::{IcpMapPose, read_map};
 use agent_offline::sweep_database::read_database;
 use anyhow::Context;
 use clap::ValueEnum;
-use dataset::LeftOut;
+use dataset::{self, LeftOut};
 use localization::competitors::{EndToEndLocalizer, LightLoc, Retrieval};
 use localization::pgc::confidence::{CONFIDENCE_KEY, Confidence, ConfidenceModel, FitReport, check_good_loss};
 use localization::pgc::pose_solver::{PoseSolver, Solver};
+use localization::pgc::wrong_place::wrong_place_hint;
 use localization::pgc::{Localize, Localizer};
 use localization::pose_source::{PoseSource, TrackedPose, TrackedPoseConfig};
 use localization::registration::icp::IcpConfig;
@@ -170,6 +171,9 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     }
     args.write(if args.tracked { &tracked } else { &sweeps })?;
     let summary = LocalizationSummary::of(&sweeps);
+    if let ([(head, scenes)], true) = (&groups[..], summary.no_pose == summary.sweeps && args.uses_head()) {
+        output::note(wrong_place_hint(summary.sweeps as u64, head, map_text(scenes).as_deref()));
+    }
     let tracked = args.tracked.then(|| LocalizationSummary::of(&tracked));
     match (&tracked, args.json) {
         (Some(tracked), true) => {
@@ -195,6 +199,11 @@ impl Args {
         let config = IcpConfig::default();
         let map = read_map(&self.icp_map, self.map_spacing, &config).map_err(BadInput::of)?;
         Ok(Subject::Source(Box::new(IcpMapPose::new(Arc::new(map), config))))
+    }
+
+    /// True unless another method takes the place of the head.
+    fn uses_head(&self) -> bool {
+        self.icp_map.is_empty() && self.end_to_end.is_none()
     }
 
     fn inference(&self) -> Result<Inference, BadInput> {
@@ -295,6 +304,12 @@ impl Args {
         }
         Ok(())
     }
+}
+
+/// Name of the generated map of the first scenario.
+fn map_text(scenes: &[PathBuf]) -> Option<String> {
+    let dataset = dataset::open(scenes.first()?).ok()?;
+    Some(dataset.scenarios.first()?.generated_map().ok()?.to_string())
 }
 
 fn report_line(report: &FitReport) -> String {

@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use dataset::{self, LeftOut, LoadOptions, Problem, Scenario};
 use indicatif::ProgressBar;
+use localization::pgc::wrong_place::wrong_place_hint;
 use localization::pose_source::{LocalizedPose, PgcConfig, PoseInput, PoseRow, PoseSource, PoseTable};
 use perception::inference::Inference;
 use perception::int8::InferencePrecision;
@@ -50,6 +51,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     scenarios.retain(|scenario| !done.has(&scenario.name));
     // All heads are found before any is computed with.
     let heads: Vec<&Path> = scenarios.iter().map(|scenario| head_of(&args.head, scenario)).collect::<Result<_, _>>()?;
+    let first_head = heads.first().copied();
     let sweeps: usize = scenarios.iter().map(frames).sum();
     if sweeps == 0 && done.is_empty() {
         let scenes: Vec<String> = args.scene.iter().map(|scene| scene.display().to_string()).collect();
@@ -62,6 +64,10 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
         found += args.localize(scenario, head, &mut left_out, &bar)?;
     }
     bar.finish_and_clear();
+    if let (0, 1.., Some(head), Some(scenario)) = (found, sweeps, first_head, scenarios.first()) {
+        let map = scenario.generated_map().ok().map(|map| map.to_string());
+        output::note(wrong_place_hint(sweeps as u64, head, map.as_deref()));
+    }
     output::line(format_args!(
         "{sweeps} sweeps, {found} with a pose; {} were in the table before: {}",
         done.len(),

@@ -2,6 +2,8 @@
 
 pub(crate) mod eval;
 pub(crate) mod localize;
+pub(crate) mod locate;
+pub(crate) mod map;
 pub(crate) mod quantise;
 mod scene_heads;
 pub(crate) mod train;

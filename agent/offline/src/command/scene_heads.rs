@@ -4,24 +4,14 @@ use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
 use anyhow::Context;
-use dataset::{self, Scenario};
-use serde::Deserialize;
+use dataset::{self, GeneratedMap, Scenario};
 
 use support::cli::BadInput;
-
-/// A generated scene: the name of its road map and the seed of its objects.
-#[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
-struct MapKey {
-    #[serde(rename = "town")]
-    name: String,
-    #[serde(rename = "town_seed")]
-    map_seed: u64,
-}
 
 /// Weights and their scene: `FILE` for all scenes, `MAP=FILE` and `MAP:SEED=FILE` for generated ones.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct SceneHeadFile {
-    map: Option<MapKey>,
+    map: Option<GeneratedMap>,
     weights: PathBuf,
 }
 
@@ -33,8 +23,8 @@ impl FromStr for SceneHeadFile {
             return Ok(Self { map: None, weights: text.into() });
         };
         let (name, seed) = map.split_once(':').unwrap_or((map, "0"));
-        let map_seed = seed.parse().map_err(|_| format!("{seed:?} is no seed of a map"))?;
-        Ok(Self { map: Some(MapKey { name: name.to_owned(), map_seed }), weights: weights.into() })
+        let seed = seed.parse().map_err(|_| format!("{seed:?} is no seed of a map"))?;
+        Ok(Self { map: Some(GeneratedMap { name: name.to_owned(), seed }), weights: weights.into() })
     }
 }
 
@@ -50,11 +40,10 @@ pub(crate) fn head_of<'a>(heads: &'a [SceneHeadFile], scenario: &Scenario) -> Re
         let (weights, count) = (weights.display(), heads.len());
         return Err(BadInput::new(format!("--head {weights}: of {count} heads each needs its map, MAP={weights}")));
     }
-    let map =
-        map_of(scenario).with_context(|| format!("the map of scenario {}", scenario.name)).map_err(BadInput::of)?;
+    let map = scenario.generated_map();
+    let map = map.with_context(|| format!("the map of scenario {}", scenario.name)).map_err(BadInput::of)?;
     let head = heads.iter().find(|head| head.map.as_ref() == Some(&map));
-    let MapKey { name, map_seed } = &map;
-    let missing = || BadInput::new(format!("{}: no --head for map {name}:{map_seed}", scenario.name));
+    let missing = || BadInput::new(format!("{}: no --head for map {map}", scenario.name));
     Ok(&head.ok_or_else(missing)?.weights)
 }
 
@@ -86,22 +75,6 @@ pub(crate) fn by_head<'a>(
     Ok(groups)
 }
 
-/// The part of `data_protocol.yaml` that names the map.
-#[derive(Debug, Deserialize)]
-struct ProtocolFile {
-    generator: MapKey,
-}
-
-/// Reads the generated map of a scenario.
-fn map_of(scenario: &Scenario) -> anyhow::Result<MapKey> {
-    let points = scenario.points_path(0, 0, None)?;
-    let folder = points.ancestors().nth(2).context("it lies in no folder")?;
-    let path = folder.join("data_protocol.yaml");
-    let text = std::fs::read_to_string(&path).with_context(|| path.display().to_string())?;
-    let file: ProtocolFile = serde_saphyr::from_str(&text).with_context(|| path.display().to_string())?;
-    Ok(file.generator)
-}
-
 #[cfg(test)]
 mod tests {
     use simulator::generate::{Subset, SynthOptions, generate};
@@ -110,19 +83,12 @@ mod tests {
 
     #[test]
     fn heads_are_of_one_town_or_of_all() {
-        let map = |name: &str, map_seed| Some(MapKey { name: name.into(), map_seed });
+        let map = |name: &str, seed| Some(GeneratedMap { name: name.into(), seed });
         for (text, expected) in [("h.st", None), ("town1=h.st", map("town1", 0)), ("town4:3=h.st", map("town4", 3))] {
             let head: SceneHeadFile = text.parse().unwrap();
             assert_eq!((head.map, head.weights), (expected, PathBuf::from("h.st")), "{text}");
         }
         assert!("town1:x=h".parse::<SceneHeadFile>().unwrap_err().contains('x'));
-    }
-
-    #[test]
-    fn the_town_of_a_generated_scene_is_read_from_its_protocol() {
-        let text = "description: x\ngenerator:\n  name: synth\n  town: 'town4'\n  town_seed: 5\nworld:\n  seed: 1\n";
-        let file: ProtocolFile = serde_saphyr::from_str(text).unwrap();
-        assert_eq!(file.generator, MapKey { name: "town4".into(), map_seed: 5 });
     }
 
     #[test]

@@ -64,11 +64,11 @@ impl FeatureCache {
         let total = list.len() * augmentation.copies.max(1);
         let config = encoder.config().clone();
         let source = Arc::clone(list);
-        let prepare = move |batch: u64| -> Result<Vec<TurnedSweep>, LocalizerTrainError> {
+        let prepare = move |batch: u64| -> Vec<TurnedSweep> {
             let numbers = (batch * BATCH..(batch + 1) * BATCH).filter(|&number| (number as usize) < total);
             let prepared = numbers.map(|number| {
                 let (index, copy) = (number as usize % source.len(), number as usize / source.len());
-                let Some(stored) = source.read(index, config.range_m)? else { return Ok(None) };
+                let stored = source.read(index, config.range_m)?;
                 let mut rng = ChaCha8Rng::seed_from_u64(seed);
                 rng.set_stream(number);
                 let (turn, keep) = match copy {
@@ -78,16 +78,16 @@ impl FeatureCache {
                         (yaw(rng.random_range(-angle..angle)), rng.random_range(augmentation.keep..=1.0))
                     }
                 };
-                Ok(Some(TurnedSweep::new(&stored, &turn, keep, &mut rng, &config)))
+                Some(TurnedSweep::new(&stored, &turn, keep, &mut rng, &config))
             });
-            prepared.filter_map(Result::transpose).collect()
+            prepared.flatten().collect()
         };
         let mut loader = Prefetch::start(loader_threads, 0, prepare);
         let rows = (total * CELLS) as i64;
         let mut builder = Builder::new(rows, encoder.config().cell_channels(), device)?;
         let mut done = 0;
         while done < total {
-            let batch = loader.next_batch()??;
+            let batch = loader.next_batch()?;
             if !batch.is_empty() {
                 builder.add(&batch, encoder, precision.kind(), device)?;
             }

@@ -24,5 +24,7 @@ pub use pairs::Pair;
 pub(crate) use redundancy::Redundancy;
 pub use redundancy::RedundancyConfig;
 pub use scene_training::{SceneReport, SceneSummary, SceneTrainConfig, train_scene};
+pub(crate) use scene_training::{SceneSweeps, train_scene_on};
 pub use scene_validation::SceneAccuracy;
-pub(crate) use sweep_store::SweepList;
+pub(crate) use sweep_store::{SweepList, yaw};
+pub(crate) use turned_sweep::CELLS;

@@ -1,10 +1,11 @@
 //! Sweeps with true poses, kept in memory: centimetres as 16-bit integers, a third of a megabyte each.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 
-use dataset::{self, LoadOptions, Scenario};
+use dataset::frame::Frame;
+use dataset::{self, LoadOptions, ReadError, Scenario};
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 use rand::Rng;
 
@@ -59,7 +60,7 @@ impl StoredSweep {
 
 /// A rotation about the vertical.
 #[must_use]
-pub(super) fn yaw(angle_rad: f64) -> Isometry3<f64> {
+pub(crate) fn yaw(angle_rad: f64) -> Isometry3<f64> {
     Isometry3::from_parts(Translation3::identity(), UnitQuaternion::from_axis_angle(&Vector3::z_axis(), angle_rad))
 }
 
@@ -78,9 +79,11 @@ pub(crate) struct SweepList {
     problems: Vec<String>,
     /// Indices of the sweeps without a pose among those read so far.
     without_pose: Mutex<BTreeSet<usize>>,
+    /// Faults of the sweeps that could not be read so far, by index.
+    unreadable: Mutex<BTreeMap<usize, String>>,
 }
 
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 struct Place {
     scenario: Arc<Scenario>,
     agent: usize,
@@ -114,14 +117,56 @@ impl SweepList {
             return Err(LocalizerTrainError::NoSweeps(folders.to_vec()));
         }
         let sha256 = dataset::content_sha256(scenarios.iter().map(AsRef::as_ref));
-        Ok(Self { places, sha256, problems, without_pose: Mutex::default() })
+        Ok(Self { places, sha256, problems, without_pose: Mutex::default(), unreadable: Mutex::default() })
     }
 
     /// Identity of the data, and the part of it that proved unusable so far.
     #[must_use]
     pub(crate) fn data(&self) -> DataListing {
         let without_pose = self.without_pose.lock().unwrap_or_else(PoisonError::into_inner).len();
-        DataListing { sha256: self.sha256.clone(), without_pose, problems: self.problems.clone() }
+        let unreadable = self.unreadable.lock().unwrap_or_else(PoisonError::into_inner);
+        let problems = self.problems.iter().chain(unreadable.values()).cloned().collect();
+        DataListing { sha256: self.sha256.clone(), without_pose, problems }
+    }
+
+    /// The sweeps at some indices, as a list of their own, in the order given.
+    #[must_use]
+    pub(crate) fn subset(&self, indices: &[usize]) -> Self {
+        let places = indices.iter().filter_map(|&index| self.places.get(index).cloned()).collect();
+        let (sha256, problems) = (self.sha256.clone(), self.problems.clone());
+        Self { places, sha256, problems, without_pose: Mutex::default(), unreadable: Mutex::default() }
+    }
+
+    /// Drive of each sweep, and its pose without reading points; `None` for a sweep without one.
+    pub(crate) fn poses(&self) -> Vec<(usize, Option<Isometry3<f64>>)> {
+        let options = LoadOptions { points: false, ..LoadOptions::default() };
+        let pose = |(index, Place { scenario, agent, tick, drive, .. }): (usize, &Place)| match scenario
+            .load(*agent, *tick, &options)
+        {
+            Ok(frame) => (*drive, frame.world_from_lidar.map(|pose| pose.isometry())),
+            Err(error) => {
+                self.leave_out(index, &error);
+                (*drive, None)
+            }
+        };
+        self.places.iter().enumerate().map(pose).collect()
+    }
+
+    /// Reads the whole frame of a sweep, with the names of its scenario and its files; `None` if it cannot be read.
+    pub(crate) fn frame(&self, index: usize) -> Option<(Frame, String, String)> {
+        let Place { scenario, agent, tick, .. } = self.places.get(index)?;
+        let stem = scenario.ticks.get(*tick)?.stem.clone();
+        match scenario.load(*agent, *tick, &LoadOptions::default()) {
+            Ok(frame) => Some((frame, scenario.name.clone(), stem)),
+            Err(error) => {
+                self.leave_out(index, &error);
+                None
+            }
+        }
+    }
+
+    fn leave_out(&self, index: usize, error: &ReadError) {
+        self.unreadable.lock().unwrap_or_else(PoisonError::into_inner).insert(index, error.to_string());
     }
 
     /// Keeps at most `count` sweeps, evenly spread.
@@ -143,20 +188,18 @@ impl SweepList {
         self.places.len()
     }
 
-    /// Reads one sweep, points within `range_m` of the sensor; `None` if its pose is unknown.
-    ///
-    /// # Errors
-    /// [`LocalizerTrainError::Read`] names the file.
-    pub(crate) fn read(&self, index: usize, range_m: f64) -> Result<Option<StoredSweep>, LocalizerTrainError> {
-        let Place { scenario, agent, tick, world, drive } = &self.places[index];
-        let mut frame = scenario.load(*agent, *tick, &LoadOptions::default())?;
+    /// Reads one sweep, points within `range_m` of the sensor; `None` if its pose is unknown or it cannot be read, which
+    /// is counted.
+    pub(crate) fn read(&self, index: usize, range_m: f64) -> Option<StoredSweep> {
+        let Place { world, drive, .. } = self.places[index];
+        let (mut frame, ..) = self.frame(index)?;
         let Some(pose) = frame.world_from_lidar else {
             self.without_pose.lock().unwrap_or_else(PoisonError::into_inner).insert(index);
-            return Ok(None);
+            return None;
         };
         let range = range_m as f32;
         frame.points.xyzi.retain(|[x, y, z, _]| x * x + y * y <= range * range && z.is_finite());
-        Ok(Some(StoredSweep::new(*world, *drive, pose.isometry(), &frame.points.xyzi)))
+        Some(StoredSweep::new(world, drive, pose.isometry(), &frame.points.xyzi))
     }
 }
 
@@ -181,11 +224,11 @@ impl SweepStore {
         let threads = std::thread::available_parallelism().map_or(1, usize::from);
         let mut reader = Prefetch::start(threads, 0, move |number| match (number as usize) < count {
             true => source.read(number as usize, range_m),
-            false => Ok(None),
+            false => None,
         });
         let mut sweeps = Vec::with_capacity(count);
         for _ in 0..count {
-            sweeps.extend(reader.next_batch()??);
+            sweeps.extend(reader.next_batch()?);
         }
         match sweeps.is_empty() {
             true => Err(LocalizerTrainError::NoSweeps(folders.to_vec())),

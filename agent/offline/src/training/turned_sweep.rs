@@ -8,7 +8,7 @@ use super::sweep_store::StoredSweep;
 use localization::pgc::{SceneEncoderConfig, SweepVoxels};
 
 /// Number of cells of a sweep that are training examples.
-pub(super) const CELLS: usize = 400;
+pub(crate) const CELLS: usize = 400;
 
 /// A sweep, rotated and subsampled.
 pub(super) struct TurnedSweep {

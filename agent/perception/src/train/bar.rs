@@ -23,8 +23,10 @@ pub struct TrainingBar {
     is_watched: bool,
     last_line: Cell<Option<Instant>>,
     encoding: Cell<Option<Encoding>>,
-    /// Length of the training that follows the encoding.
+    /// Length of the training.
     length: Option<Length>,
+    /// True if the length includes the encoding.
+    includes_encoding: bool,
 }
 
 /// Progress of the encoding of one data set.
@@ -41,7 +43,14 @@ struct Encoding {
 impl Default for TrainingBar {
     fn default() -> Self {
         let bar = progress::percent_bar(PARTS);
-        Self { is_watched: !bar.is_hidden(), bar, last_line: Cell::new(None), encoding: Cell::new(None), length: None }
+        Self {
+            is_watched: !bar.is_hidden(),
+            bar,
+            last_line: Cell::new(None),
+            encoding: Cell::new(None),
+            length: None,
+            includes_encoding: false,
+        }
     }
 }
 
@@ -52,9 +61,20 @@ impl TrainingBar {
         Self { length: Some(length), ..Self::default() }
     }
 
+    /// The same for a training whose time counts from the start of the encoding.
+    #[must_use]
+    pub fn including_encoding(length: Length) -> Self {
+        Self { includes_encoding: true, ..Self::of(length) }
+    }
+
     /// Shows the progress: `share_done` 0..1 after `seconds`, and a text.
     pub fn report(&self, share_done: f64, seconds: f64, text: &str) {
-        self.show(share_done, remaining_s(share_done, 1.0 - share_done, seconds), text);
+        let remaining_s = match self.length {
+            // The clock ends it, whatever part of the time the encoding took.
+            Some(Length::Time(limit)) => Some((limit.as_secs_f64() - seconds).max(0.0)),
+            _ => remaining_s(share_done, 1.0 - share_done, seconds),
+        };
+        self.show(share_done, remaining_s, text);
     }
 
     /// Shows that `done` of `all` sweeps of a data set are encoded; a smaller number than before belongs to the next
@@ -67,7 +87,8 @@ impl TrainingBar {
         let passed = encoding.began.elapsed();
         let remaining_s = remaining_s((done - encoding.first) as f64, left, passed.as_secs_f64());
         if let Some(remaining_s) = remaining_s.filter(|_| !encoding.is_estimated && passed >= ESTIMATE_AFTER) {
-            self.print_line(&estimate(all, passed.as_secs_f64() + remaining_s, self.length));
+            let seconds = passed.as_secs_f64() + remaining_s;
+            self.print_line(&estimate(all, seconds, self.length, self.includes_encoding));
             encoding.is_estimated = true;
         }
         self.encoding.set(Some(encoding));
@@ -97,8 +118,15 @@ impl TrainingBar {
 }
 
 /// Estimate of the duration of the encoding of all sweeps, and the training after it.
-fn estimate(sweeps: usize, seconds: f64, length: Option<Length>) -> String {
+fn estimate(sweeps: usize, seconds: f64, length: Option<Length>, includes_encoding: bool) -> String {
     let then = match length {
+        Some(Length::Time(time)) if includes_encoding && time.as_secs_f64() <= seconds => {
+            format!(", all of the {} in all: the training needs more time", minutes(time.as_secs_f64()))
+        }
+        Some(Length::Time(time)) if includes_encoding => {
+            let left_s = time.as_secs_f64() - seconds;
+            format!(" of the {} in all, which leaves {} for the training", minutes(time.as_secs_f64()), minutes(left_s))
+        }
         Some(Length::Time(time)) => format!(", then {} of training", minutes(time.as_secs_f64())),
         Some(Length::Steps(steps)) => format!(", then {steps} steps of training"),
         Some(Length::Epochs(epochs)) => format!(", then {epochs} passes of training"),
@@ -130,11 +158,20 @@ mod tests {
 
     #[test]
     fn the_durations_of_encoding_and_training_are_estimated() {
-        let training = |length| estimate(600, 540.0, length);
+        let training = |length| estimate(600, 540.0, length, false);
         let time = Some(Length::Time(Duration::from_secs(1200)));
         assert_eq!(training(time), "encoding 600 sweeps takes 9 min, then 20 min of training");
         assert_eq!(training(Some(Length::Steps(50))), "encoding 600 sweeps takes 9 min, then 50 steps of training");
-        assert_eq!(estimate(20, 42.4, None), "encoding 20 sweeps takes 42 s");
+        assert_eq!(estimate(20, 42.4, None, false), "encoding 20 sweeps takes 42 s");
+        let within = |time| estimate(600, 540.0, Some(Length::Time(Duration::from_secs(time))), true);
+        assert_eq!(
+            within(1200),
+            "encoding 600 sweeps takes 9 min of the 20 min in all, which leaves 11 min for the training"
+        );
+        assert_eq!(
+            within(180),
+            "encoding 600 sweeps takes 9 min, all of the 3 min in all: the training needs more time"
+        );
     }
 
     #[test]

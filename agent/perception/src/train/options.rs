@@ -144,7 +144,15 @@ impl TrainingOptions {
     }
 }
 
-/// True if the CPU multiplies in bfloat16 natively.
+impl ComputePrecision {
+    /// The fastest number format of a device.
+    #[must_use]
+    pub fn fastest_on(device: Device) -> Self {
+        if device != Device::Cpu || has_bfloat16() { Self::Bf16 } else { Self::F32 }
+    }
+}
+
+/// True if the CPU multiplies in bfloat16 natively (AVX512-BF16, which every CPU with AMX has too).
 fn has_bfloat16() -> bool {
     #[cfg(target_arch = "x86_64")]
     return std::arch::is_x86_feature_detected!("avx512bf16");

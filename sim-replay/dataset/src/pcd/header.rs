@@ -16,7 +16,7 @@ const MAX_COUNT: u64 = 65_536;
 /// Most bytes of one number.
 const MAX_SIZE: usize = 8;
 /// Names of intensity, the preferred first, compared without case.
-const INTENSITY: [&str; 8] =
+pub(crate) const INTENSITY: [&str; 8] =
     ["intensity", "i", "scalar_intensity", "reflectivity", "scalar_reflectivity", "reflectance", "remission", "signal"];
 /// Names of packed colours, whose red byte is an intensity.
 const COLOURS: [&str; 2] = ["rgb", "rgba"];

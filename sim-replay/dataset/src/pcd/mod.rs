@@ -27,6 +27,7 @@ use serde::Serialize;
 
 pub use encode::{Encoding, IntensityField, encode};
 
+pub(crate) use header::INTENSITY;
 use header::{Data, Header};
 
 /// Red of full intensity.

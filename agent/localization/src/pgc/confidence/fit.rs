@@ -100,12 +100,13 @@ pub fn observed(error_m: f64) -> f64 {
     1.0 / (1.0 + error_m * error_m)
 }
 
-/// The highest threshold below which at most a share `good_loss` of the good poses lies.
+/// The highest threshold below which at most a share `good_loss` of the good poses lies; 1, which rejects every pose,
+/// without good ones.
 fn threshold(sigmas: &[(f64, bool)], good_loss: f64) -> f64 {
     let mut good: Vec<f64> = sigmas.iter().filter(|(_, is_good)| *is_good).map(|(sigma, _)| *sigma).collect();
     good.sort_by(f64::total_cmp);
     let lost = (good_loss * good.len() as f64).floor() as usize;
-    good.get(lost).copied().unwrap_or(0.0)
+    good.get(lost).copied().unwrap_or(1.0)
 }
 
 /// Ridge regression with weights that are not negative, on standardised features, by coordinate descent.
@@ -198,6 +199,6 @@ mod tests {
         let sigmas: Vec<(f64, bool)> = (0..100).map(|k| (f64::from(k) / 100.0, k > 4)).collect();
         let below = threshold(&sigmas, 0.02);
         assert_eq!(sigmas.iter().filter(|(sigma, is_good)| *is_good && *sigma < below).count(), 1);
-        assert_eq!(threshold(&[], 0.02), 0.0);
+        assert_eq!(threshold(&[(0.9, false)], 0.02), 1.0);
     }
 }

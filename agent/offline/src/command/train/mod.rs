@@ -2,7 +2,7 @@
 
 mod encoder;
 mod end_to_end;
-mod options;
+pub(super) mod options;
 mod scene;
 
 use anyhow::Context;

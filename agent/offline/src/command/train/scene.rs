@@ -72,7 +72,7 @@ pub(crate) struct Args {
 
 pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     let config = args.config()?;
-    let bar = TrainingBar::of(config.run.length);
+    let bar = TrainingBar::including_encoding(config.run.length);
     let summary = train_scene(&config, &mut |report| tell(&bar, report))?;
     bar.finish();
     card(&config, &summary).write(&config.run.out)?;

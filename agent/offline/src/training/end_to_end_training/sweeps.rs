@@ -20,7 +20,7 @@ use perception::train::{Prefetch, RunConfig};
 /// Largest rotation of a sweep, radians.
 const TURN_RAD: f64 = 10.0 * PI / 180.0;
 
-type Batches = Prefetch<Result<Vec<TurnedSweep>, LocalizerTrainError>>;
+type Batches = Prefetch<Vec<TurnedSweep>>;
 
 /// Batches of sweeps.
 pub(super) struct Sweeps {
@@ -58,7 +58,7 @@ impl Examples for Sweeps {
     }
 
     fn next_loss(&mut self, network: &EndToEnd) -> Result<(Tensor, f64), LocalizerTrainError> {
-        let batch = self.batches.next_batch()??;
+        let batch = self.batches.next_batch()?;
         let (kind, device) = (self.run.precision.kind(), self.run.device);
         let sweeps: Vec<&SweepVoxels> = batch.iter().map(|example| &example.voxels).collect();
         let voxels = VoxelBatch::new(&sweeps, network.encoder().config(), device)?;
@@ -91,7 +91,7 @@ impl Examples for Sweeps {
 fn middle(list: &SweepList) -> Result<[f64; 3], LocalizerTrainError> {
     let mut sum = [0.0; 4];
     for index in (0..list.len()).step_by((list.len() / 200).max(1)) {
-        if let Some(sweep) = list.read(index, 1.0)? {
+        if let Some(sweep) = list.read(index, 1.0) {
             (0..3).for_each(|axis| sum[axis] += sweep.world_from_sensor.translation.vector[axis]);
             sum[3] += 1.0;
         }
@@ -112,13 +112,13 @@ fn batches(list: &Arc<SweepList>, encoder: &SceneEncoderConfig, run: &RunConfig,
             let mut rng = ChaCha8Rng::seed_from_u64(seed);
             rng.set_stream(index);
             let stored = loop {
-                if let Some(stored) = list.read(rng.random_range(0..list.len()), encoder.range_m)? {
+                if let Some(stored) = list.read(rng.random_range(0..list.len()), encoder.range_m) {
                     break stored;
                 }
             };
             let turn = yaw(rng.random_range(-TURN_RAD..TURN_RAD));
             let keep = rng.random_range(0.7..1.0);
-            Ok(TurnedSweep::new(&stored, &turn, keep, &mut rng, &encoder))
+            TurnedSweep::new(&stored, &turn, keep, &mut rng, &encoder)
         };
         (number * batch..(number + 1) * batch).map(example).collect()
     })

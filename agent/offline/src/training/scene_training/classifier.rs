@@ -1,5 +1,7 @@
 //! Classifier of a head, trained before its regressor: assigns a sweep to a cluster of sensor positions.
 
+use std::time::{Duration, Instant};
+
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use tch::nn::VarStore;
@@ -17,19 +19,26 @@ const LEARNING_RATE: f64 = 2e-3;
 /// Label smoothing, as in LightLoc.
 const LABEL_SMOOTHING: f64 = 0.1;
 
-/// Trains with cross entropy and label smoothing; the share of training sweeps that are classified correctly.
+/// Trains with cross entropy and label smoothing, at most for `limit`; the share of training sweeps that are classified correctly.
 pub(super) fn train_classifier(
     head: &SceneHead,
     variables: &VarStore,
     cache: &FeatureCache,
     class_of_sweep: &[usize],
     seed: u64,
+    limit: Option<Duration>,
 ) -> Result<f64, TchError> {
     let classes: Vec<i64> = class_of_sweep.iter().map(|&class| class as i64).collect();
     let classes = Tensor::f_from_slice(&classes)?.f_to_device(variables.device())?;
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let mut optimizer = AdamW::new(variables, AdamWConfig::default());
+    let started = Instant::now();
     for step in 0..STEPS {
+        let of_time = limit.map_or(0.0, |limit| started.elapsed().as_secs_f64() / limit.as_secs_f64().max(1e-3));
+        let share_done = of_time.max(step as f64 / STEPS as f64);
+        if share_done >= 1.0 {
+            break;
+        }
         let rows: Vec<i64> = (0..BATCH).map(|_| rng.random_range(0..cache.sweep_count()) as i64).collect();
         let rows = Tensor::f_from_slice(&rows)?.f_to_device(variables.device())?;
         let logits = head.classify(&cache.sweeps.f_index_select(0, &rows)?, true)?;
@@ -40,7 +49,7 @@ pub(super) fn train_classifier(
         let loss = -(hit * (1.0 - LABEL_SMOOTHING) + even * LABEL_SMOOTHING);
         optimizer.zero_grad();
         loss.f_backward()?;
-        optimizer.step(OneCycle { peak: LEARNING_RATE }.at(step as f64 / STEPS as f64))?;
+        optimizer.step(OneCycle { peak: LEARNING_RATE }.at(share_done))?;
     }
     let found = no_grad(|| head.classify(&cache.sweeps, false)?.f_argmax(1, false)?.f_eq_tensor(&classes))?;
     found.f_to_kind(Kind::Float)?.f_mean(Kind::Float)?.f_double_value(&[])

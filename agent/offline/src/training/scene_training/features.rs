@@ -7,6 +7,14 @@ use crate::training::{FeatureCache, LocalizerTrainError, SweepAugmentation, Swee
 use localization::pgc::{SceneEncoder, SceneEncoderConfig};
 use perception::train::DataListing;
 
+/// Sweeps of a scene.
+pub(crate) struct SceneSweeps {
+    /// Sweeps that the head is trained on.
+    pub(crate) training: Arc<SweepList>,
+    /// Sweeps that it is validated on.
+    pub(crate) validation: Option<Arc<SweepList>>,
+}
+
 /// Features of the sweeps of a scene.
 pub(super) struct Features {
     pub(super) training: FeatureCache,
@@ -18,30 +26,24 @@ pub(super) struct Features {
 }
 
 impl Features {
-    /// Reads and encodes the sweeps that `config` names.
+    /// Reads and encodes sweeps.
     pub(super) fn compute(
         config: &SceneTrainConfig,
+        sweeps: &SceneSweeps,
         observe: &mut dyn FnMut(&SceneReport),
     ) -> Result<Self, LocalizerTrainError> {
         let (encoder, encoder_sha256) = SceneEncoder::load(&config.encoder, config.run.device)?;
-        let list = Arc::new(SweepList::open(&config.scenes)?);
         let mut encode = |list: &Arc<SweepList>, augmentation| {
             let mut progress = |done, total| observe(&SceneReport::Encoding(done, total));
             let cache = FeatureCache::build(list, &encoder, augmentation, &config.run, &mut progress)?;
             observe(&SceneReport::Encoded(list.data()));
             Ok::<_, LocalizerTrainError>(cache)
         };
-        let training = encode(&list, config.augmentation)?;
-        let validation = match config.validation.as_slice() {
-            [] => None,
-            folders => {
-                let mut list = SweepList::open(folders)?;
-                list.thin_out(config.validation_sweeps);
-                let unchanged = SweepAugmentation { copies: 1, ..config.augmentation };
-                Some(encode(&Arc::new(list), unchanged)?)
-            }
-        };
+        let training = encode(&sweeps.training, config.augmentation)?;
+        let unchanged = SweepAugmentation { copies: 1, ..config.augmentation };
+        let validation = sweeps.validation.as_ref().map(|list| encode(list, unchanged)).transpose()?;
+        let data = sweeps.training.data();
         let encoder = encoder.config().clone();
-        Ok(Self { training, validation, encoder, encoder_sha256, data: list.data() })
+        Ok(Self { training, validation, encoder, encoder_sha256, data })
     }
 }

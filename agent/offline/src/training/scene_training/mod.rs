@@ -11,7 +11,8 @@ mod losses;
 mod statistics;
 
 use std::collections::BTreeMap;
-use std::time::Instant;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
 
 use tch::nn::VarStore;
 use tch::{Kind, Tensor, no_grad};
@@ -22,21 +23,25 @@ use self::cell_order::CellOrder;
 use self::coarse_pose::CoarsePoses;
 use self::continued::StoredHead;
 use self::features::Features;
+pub(crate) use self::features::SceneSweeps;
 use self::losses::{centre_loss, weighted_loss};
 use super::error::LocalizerTrainError;
 use super::feature_cache::FeatureCache;
 use super::kmeans::kmeans;
 use super::redundancy::Redundancy;
 use super::scene_validation::{SceneAccuracy, validate};
+use super::sweep_store::SweepList;
 use localization::pgc::SceneHead;
 use localization::pgc::SceneHeadConfig;
-use perception::train::{Curve, DataListing, Length, Trainer};
+use perception::train::{Curve, DataListing, Length, RunConfig, Trainer};
 use perception::weights::{CONFIG_KEY, KIND_KEY};
 
 /// Weight of a unit of cross entropy over the centres, metres.
 const CENTRE_WEIGHT_M: f64 = 5.0;
 /// Steps between two draws of the classifier's dropout.
 const LOGITS_EVERY: u64 = 50;
+/// Largest share of a training by the clock that its classifier takes.
+const CLASSIFIER_SHARE: f64 = 0.12;
 /// Steps between two reports.
 const REPORT_EVERY: u64 = 20;
 /// Largest number of cells of a sweep that a head regresses.
@@ -50,7 +55,28 @@ pub fn train_scene(
     config: &SceneTrainConfig,
     observe: &mut dyn FnMut(&SceneReport),
 ) -> Result<SceneSummary, LocalizerTrainError> {
-    let mut training = Training::prepare(config, observe)?;
+    let training = Arc::new(SweepList::open(&config.scenes)?);
+    let validation = match config.validation.as_slice() {
+        [] => None,
+        folders => {
+            let mut list = SweepList::open(folders)?;
+            list.thin_out(config.validation_sweeps);
+            Some(Arc::new(list))
+        }
+    };
+    train_scene_on(config, &SceneSweeps { training, validation }, observe)
+}
+
+/// The same on lists of sweeps in place of the folders of `config`.
+///
+/// # Errors
+/// As [`train_scene`].
+pub(crate) fn train_scene_on(
+    config: &SceneTrainConfig,
+    sweeps: &SceneSweeps,
+    observe: &mut dyn FnMut(&SceneReport),
+) -> Result<SceneSummary, LocalizerTrainError> {
+    let mut training = Training::prepare(config, sweeps, observe)?;
     let mut last_validation = Instant::now();
     while training.share_done() < 1.0 {
         training.step()?;
@@ -91,12 +117,13 @@ struct Training<'a> {
 impl<'a> Training<'a> {
     fn prepare(
         config: &'a SceneTrainConfig,
+        sweeps: &SceneSweeps,
         observe: &mut dyn FnMut(&SceneReport),
     ) -> Result<Self, LocalizerTrainError> {
         let started = Instant::now();
         let run = &config.run;
         run.start()?;
-        let features = Features::compute(config, observe)?;
+        let features = Features::compute(config, sweeps, observe)?;
         let stored = config.init.as_ref().map(|init| StoredHead::load(init, &config.encoder, &features.encoder_sha256));
         let stored = stored.transpose()?;
         let head_config = match &stored {
@@ -120,7 +147,14 @@ impl<'a> Training<'a> {
             }
         };
         if !run.resume {
-            let share = classifier::train_classifier(&head, &variables, &cache, &class_of_sweep, run.seed)?;
+            let share = classifier::train_classifier(
+                &head,
+                &variables,
+                &cache,
+                &class_of_sweep,
+                run.seed,
+                classifier_time(run),
+            )?;
             observe(&SceneReport::Classified(share));
         }
         let trainer = Trainer::begin(run, &variables, None, started)?;
@@ -251,6 +285,14 @@ impl<'a> Training<'a> {
             cells_shown: self.cells_shown,
             accuracy: self.accuracy,
         })
+    }
+}
+
+/// Longest time of the classifier's training: a part of a training by the clock.
+fn classifier_time(run: &RunConfig) -> Option<Duration> {
+    match run.length {
+        Length::Time(limit) => Some(limit.mul_f64(CLASSIFIER_SHARE)),
+        Length::Steps(_) | Length::Epochs(_) => None,
     }
 }
 

@@ -1,0 +1,281 @@
+//! `agent locate`: poses of single point clouds in the map of a scene head.
+
+use std::path::PathBuf;
+
+use agent_offline::head_files::{encoder_of, head_file};
+use dataset::cloud_files::{Cloud, CloudFile, clouds_at};
+use localization::pgc::pose_solver::FoundPose;
+use localization::pgc::{Localization, Localizer};
+use localization::pose_covariance::pose_covariance;
+use perception::inference::Inference;
+use perception::int8::InferencePrecision;
+use protocol::{NoPoseReason, PoseEstimate};
+use serde::Serialize;
+use support::cli::{BadInput, Outcome};
+use support::output;
+
+/// Find the pose of single point clouds: no other sensor, no earlier pose.
+///
+/// A cloud is one sweep in the frame of the LiDAR: metres, x forward, y left, z up, the LiDAR at the origin at its usual
+/// height above the road, a metre or more. Intensities are not used. Points that are not finite, or exactly at the origin,
+/// are left out. Readable are PCD, PLY, NumPy arrays (.npy, N x 3 or more), .bin of 32-bit floats (4 or 5 per point), and
+/// the sweeps of data sets; of a folder all of these.
+///
+/// Positions are x, y, z of the LiDAR in the frame of the map, right-handed, metres: the frame of the poses that the head
+/// was trained on, and where those were left-handed (OPV2V, CARLA), that frame with y negated. Angles are rotations about
+/// x (roll), y (pitch) and z (yaw), in this order, degrees; yaw is counter-clockwise from x, seen from above.
+#[derive(Debug, clap::Args)]
+#[command(
+    after_help = "Exit codes: 0 all found, 1 failed, 2 bad usage or a cloud that cannot be read, 3 a cloud without a \
+                        pose."
+)]
+pub(crate) struct Args {
+    /// Point clouds, or folders of them.
+    #[arg(required = true, value_name = "CLOUD")]
+    clouds: Vec<PathBuf>,
+    /// Weights of the head of the place: a file, the folder that `agent map` wrote, or a released one (town1, town4).
+    #[arg(long, value_name = "FILE")]
+    head: String,
+    /// Weights of the encoder [default: beside the head, or the released one that the head names].
+    #[arg(long, value_name = "FILE")]
+    encoder: Option<PathBuf>,
+    /// Direction of the y axis in files that belong to no data set: left, right (CARLA, OPV2V), or whichever gives a pose,
+    /// left first.
+    #[arg(long, value_enum, default_value_t = YAxis::Auto)]
+    y_axis: YAxis,
+    /// Number format in which networks are computed.
+    #[arg(long, value_enum, default_value_t)]
+    precision: InferencePrecision,
+    /// Threads to compute with.
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=256))]
+    threads: u16,
+    /// Print a JSON object per cloud, one a line.
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+enum YAxis {
+    Auto,
+    Left,
+    Right,
+}
+
+/// Result of one cloud.
+#[derive(Debug, Serialize)]
+struct Located {
+    /// Path of the file.
+    cloud: String,
+    /// Name of the head's place.
+    map: String,
+    /// Pose of the LiDAR in the map.
+    pose: Option<LocatedPose>,
+    /// Reason for the missing pose.
+    no_pose: Option<&'static str>,
+    /// The fault of a file that cannot be read.
+    error: Option<String>,
+    /// Number of cells that agree with the pose.
+    inliers: u32,
+    /// These as a share of all cells, 0..=1.
+    inlier_ratio: f64,
+    /// Number of points in the cloud.
+    points: usize,
+    /// Number of points left out: not finite, or exactly at the origin.
+    points_left_out: usize,
+    /// True if y of the file was negated.
+    is_mirrored: bool,
+}
+
+/// A pose in the map frame, right-handed.
+#[derive(Debug, Serialize)]
+struct LocatedPose {
+    /// x, y, z of the LiDAR, metres.
+    position_m: [f64; 3],
+    /// Roll, pitch, yaw, degrees.
+    roll_pitch_yaw_deg: [f64; 3],
+    /// The same rotation as a quaternion x, y, z, w.
+    quaternion_xyzw: [f64; 4],
+    /// Covariance of x, y, z (metres) and rotations about x, y, z (radians), row by row.
+    covariance: [[f64; 6]; 6],
+    /// Confidence, 0..=1.
+    confidence: f64,
+}
+
+/// Localizes every cloud and prints a line for each.
+pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
+    tch::set_num_threads(i32::from(args.threads));
+    let head = head_file(&args.head).map_err(BadInput::of)?;
+    let encoder = args.encoder.clone().map_or_else(|| encoder_of(&head), Ok).map_err(BadInput::of)?;
+    let inference = Inference { precision: args.precision, ..Inference::default() };
+    let localizer = Localizer::load(&encoder, &head, inference).map_err(BadInput::of)?;
+    let (mut found, mut lost, mut bad) = (0, 0, 0);
+    for file in clouds_at(&args.clouds) {
+        let located = args.locate(&localizer, file)?;
+        match (&located.error, &located.pose) {
+            (Some(_), _) => bad += 1,
+            (None, Some(_)) => found += 1,
+            (None, None) => lost += 1,
+        }
+        match args.json {
+            true => output::line(serde_json::to_string(&located)?)?,
+            false if located.error.is_some() => output::note(located.text()),
+            false => output::line(located.text())?,
+        }
+    }
+    if found + lost + bad > 1 {
+        output::note(format_args!("{found} clouds found, {lost} without a pose, {bad} cannot be read"));
+    }
+    if found == 0 && lost > 0 {
+        let (head, map) = (head.display(), &localizer.head_config().scene_name);
+        output::note(format_args!("no cloud found itself: is {head} the head of this place? Its map is {map}"));
+    }
+    Ok(if bad > 0 { Outcome::BadInput } else { Outcome::of(lost > 0) })
+}
+
+impl Args {
+    fn locate(&self, localizer: &Localizer, file: Result<CloudFile, dataset::ReadError>) -> anyhow::Result<Located> {
+        let map = localizer.head_config().scene_name.clone();
+        let name = |file: &CloudFile| file.path().display().to_string();
+        let (cloud, read) = match file {
+            Ok(file) => (name(&file), file.read()),
+            Err(error) => (error.path().map(|path| path.display().to_string()).unwrap_or_default(), Err(error)),
+        };
+        let Cloud { mut points, left_out, is_of_data_set } = match read {
+            Ok(read) => read,
+            Err(error) => return Ok(Located::unreadable(cloud, map, &error)),
+        };
+        let (count, y_axis) = (points.len(), if is_of_data_set { YAxis::Left } else { self.y_axis });
+        let mirror = |points: &mut protocol::PointCloud| points.xyzi.iter_mut().for_each(|point| point[1] = -point[1]);
+        if y_axis == YAxis::Right {
+            mirror(&mut points);
+        }
+        let mut localization = localizer.localize(&points)?;
+        let mut is_mirrored = y_axis == YAxis::Right;
+        if y_axis == YAxis::Auto && published(&localization).is_none() {
+            mirror(&mut points);
+            let other = localizer.localize(&points)?;
+            if published(&other).is_some() {
+                (localization, is_mirrored) = (other, true);
+            }
+        }
+        Ok(Located {
+            cloud,
+            map,
+            pose: published(&localization).map(LocatedPose::of),
+            no_pose: reason(&localization.estimate),
+            error: None,
+            inliers: localization.inlier_count,
+            inlier_ratio: localization.inlier_ratio,
+            points: count,
+            points_left_out: left_out,
+            is_mirrored,
+        })
+    }
+}
+
+/// The pose, unless it is rejected.
+fn published(localization: &Localization) -> Option<FoundPose> {
+    localization.found.filter(|found| !found.is_rejected)
+}
+
+fn reason(estimate: &PoseEstimate) -> Option<&'static str> {
+    match estimate {
+        PoseEstimate::Pose { .. } => None,
+        PoseEstimate::NoPose { reason, .. } => Some(match reason {
+            NoPoseReason::TooFewPoints => "too few points",
+            NoPoseReason::TooFewInliers => "too few inliers",
+            NoPoseReason::LowConfidence => "low confidence",
+            NoPoseReason::NoSource | NoPoseReason::Failed => "failed",
+        }),
+    }
+}
+
+impl LocatedPose {
+    fn of(found: FoundPose) -> Self {
+        let (translation, rotation) = (found.world_from_sensor.translation, found.world_from_sensor.rotation);
+        let (roll, pitch, yaw) = rotation.euler_angles();
+        Self {
+            position_m: translation.vector.into(),
+            roll_pitch_yaw_deg: [roll, pitch, yaw].map(f64::to_degrees),
+            quaternion_xyzw: rotation.coords.into(),
+            covariance: pose_covariance(&found),
+            confidence: found.sigma,
+        }
+    }
+}
+
+impl Located {
+    fn unreadable(cloud: String, map: String, error: &dataset::ReadError) -> Self {
+        Self {
+            cloud,
+            map,
+            pose: None,
+            no_pose: None,
+            error: Some(error.to_string()),
+            inliers: 0,
+            inlier_ratio: 0.0,
+            points: 0,
+            points_left_out: 0,
+            is_mirrored: false,
+        }
+    }
+
+    /// One line for a person.
+    fn text(&self) -> String {
+        let Self { cloud, inliers, points, .. } = self;
+        if let Some(error) = &self.error {
+            return format!("error: {error}");
+        }
+        let mirrored = if self.is_mirrored { ", y of the file negated" } else { "" };
+        let Some(pose) = &self.pose else {
+            let reason = self.no_pose.unwrap_or("failed");
+            return format!("{cloud}: no pose, {reason} ({inliers} inliers, {points} points)");
+        };
+        let ([x, y, z], [roll, pitch, yaw]) = (pose.position_m, pose.roll_pitch_yaw_deg);
+        let std_m = f64::midpoint(pose.covariance[0][0], pose.covariance[1][1]).sqrt();
+        let confidence = pose.confidence;
+        format!(
+            "{cloud}: x {x:.2} y {y:.2} z {z:.2} m (std {std_m:.2}), roll {roll:.2} pitch {pitch:.2} yaw {yaw:.2} degrees, \
+             confidence {confidence:.3}, {inliers} inliers{mirrored}"
+        )
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn located(pose: Option<LocatedPose>, error: Option<&str>) -> Located {
+        Located {
+            cloud: "a.pcd".into(),
+            map: "town".into(),
+            no_pose: pose.is_none().then_some("too few inliers"),
+            pose,
+            error: error.map(str::to_owned),
+            inliers: 12,
+            inlier_ratio: 0.1,
+            points: 900,
+            points_left_out: 0,
+            is_mirrored: false,
+        }
+    }
+
+    #[test]
+    fn a_line_tells_the_pose_the_reason_or_the_fault() {
+        let mut covariance = [[0.0; 6]; 6];
+        (covariance[0][0], covariance[1][1]) = (0.0025, 0.0025);
+        let pose = LocatedPose {
+            position_m: [1.0, -2.0, 0.5],
+            roll_pitch_yaw_deg: [0.0, 0.1, 90.0],
+            quaternion_xyzw: [0.0, 0.0, 0.7, 0.7],
+            covariance,
+            confidence: 0.9876,
+        };
+        assert_eq!(
+            located(Some(pose), None).text(),
+            "a.pcd: x 1.00 y -2.00 z 0.50 m (std 0.05), roll 0.00 pitch 0.10 yaw 90.00 degrees, confidence 0.988, 12 inliers"
+        );
+        assert_eq!(located(None, None).text(), "a.pcd: no pose, too few inliers (12 inliers, 900 points)");
+        assert_eq!(located(None, Some("a.pcd: cut off")).text(), "error: a.pcd: cut off");
+    }
+}

@@ -1,0 +1,187 @@
+//! `agent map`: a head for a place of one's own, in one command.
+
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use agent_offline::head_files::{ENCODER_FILE, released_encoder};
+use agent_offline::mapping::{MapConfig, MapError, MapProgress, MapReport, make_map};
+use anyhow::Context;
+use bus::malloc_settings;
+use perception::compute_device::ComputeDevice;
+use perception::train::{ComputePrecision, Length, ModelCard, OptionsError, RunConfig, TrainingBar};
+use support::cli::{BadInput, Outcome};
+use support::output;
+
+use super::train::options::check_folders;
+
+/// Name of the report beside the weights.
+const REPORT_FILE: &str = "map.json";
+
+/// Make a head for a place from drives through it, with which vehicles are localized there (agent locate, agent run).
+///
+/// Drives are data sets in any layout with poses, or folders of clouds with a file of poses (`sim-replay inspect` lists
+/// them); all poses are in one frame, which becomes that of the map. Drive every road, wide ones in both directions: roads
+/// that were not driven give no pose. An eighth of the sweeps is held out, in contiguous pieces; the head is trained on the
+/// others, and its confidence fitted and its accuracy measured on the held-out ones. Writes weights, encoder, model card and
+/// map.json.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// Drives through the place.
+    #[arg(required = true, value_name = "DRIVE")]
+    drives: Vec<PathBuf>,
+    /// Folder of the results.
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+    /// Name of the place, for messages and the model card [default: name of the folder].
+    #[arg(long, value_name = "NAME")]
+    name: Option<String>,
+    /// Time of everything, reading and encoding included, minutes.
+    #[arg(long, default_value_t = 10.0)]
+    minutes: f64,
+    /// Largest number of training sweeps, evenly spread [default: as many as there is time for].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    sweeps: Option<u32>,
+    /// Weights of the encoder [default: the released one].
+    #[arg(long, value_name = "FILE")]
+    encoder: Option<PathBuf>,
+    /// Seed of parameters and order.
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// Device to train on.
+    #[arg(long, value_enum, default_value_t)]
+    device: ComputeDevice,
+    /// Threads of the network on the CPU [default: one for each core].
+    #[arg(long, value_parser = clap::value_parser!(u16).range(1..=256))]
+    threads: Option<u16>,
+    /// Overwrite the map in --out.
+    #[arg(long)]
+    force: bool,
+    /// Print the report as JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
+    malloc_settings::ensure(&malloc_settings::FEW_PRODUCTS).context("cannot execute this program again")?;
+    let config = args.config()?;
+    let bar = TrainingBar::of(Length::Time(config.time));
+    let total_s = config.time.as_secs_f64();
+    let mut observe = |progress: MapProgress| match progress {
+        MapProgress::Note(text) => bar.print_line(&text),
+        MapProgress::At(seconds, text) => bar.report((seconds / total_s).min(1.0), seconds, &text),
+    };
+    let made = make_map(&config, &mut observe);
+    bar.finish();
+    let report = made.map_err(|error| match error.is_bad_input() {
+        true => BadInput::of(error).into(),
+        false => anyhow::Error::from(error),
+    })?;
+    write(&config, &report)?;
+    let head = report.trained.weights.display();
+    if args.json {
+        output::line(serde_json::to_string_pretty(&report)?)?;
+    } else {
+        output::text(text(&report))?;
+        output::line(format_args!("head       {head}"))?;
+    }
+    if let Some(left_out) = &report.left_out {
+        output::note(format_args!("left out: {left_out}"));
+    }
+    Ok(Outcome::of(report.left_out.is_some()))
+}
+
+impl Args {
+    fn config(&self) -> anyhow::Result<MapConfig> {
+        check_folders(&self.drives)?;
+        let time = Duration::try_from_secs_f64(60.0 * self.minutes).ok().filter(|time| !time.is_zero());
+        let time = time.ok_or_else(|| BadInput::new(format!("--minutes is {}, must be above 0", self.minutes)))?;
+        let weights = self.out.join("weights.safetensors");
+        if weights.exists() && !self.force {
+            return Err(BadInput::of(OptionsError::Trained(weights)).into());
+        }
+        let missing = || BadInput::new("no released encoder is found: --encoder FILE");
+        let encoder = self.encoder.clone().or_else(released_encoder).ok_or_else(missing)?;
+        let cores = std::thread::available_parallelism().map_or(1, usize::from);
+        let threads = self.threads.map_or(cores.min(16), usize::from);
+        tch::set_num_threads(i32::try_from(threads).unwrap_or(1));
+        let device = self.device.open().map_err(|missing| BadInput::new(format!("--device cuda: {missing}")))?;
+        Ok(MapConfig {
+            drives: self.drives.clone(),
+            place: self.name.clone().unwrap_or_else(|| name_of(&self.out)),
+            encoder,
+            time,
+            most_sweeps: self.sweeps.map(|count| usize::try_from(count).unwrap_or(usize::MAX)),
+            run: RunConfig {
+                learning_rate: 2e-3,
+                seed: self.seed,
+                device,
+                precision: ComputePrecision::fastest_on(device),
+                loader_threads: (threads / 2).max(1),
+                command: std::env::args().collect::<Vec<_>>().join(" "),
+                ..RunConfig::new(Length::Time(time), &self.out)
+            },
+        })
+    }
+}
+
+fn name_of(folder: &Path) -> String {
+    let absolute = std::path::absolute(folder).unwrap_or_else(|_| folder.to_owned());
+    absolute.file_name().map_or_else(|| "place".to_owned(), |name| name.to_string_lossy().into_owned())
+}
+
+/// Report as text.
+fn text(report: &MapReport) -> String {
+    let accuracy = report.held_out.map_or("not measured: too few sweeps".to_owned(), |accuracy| accuracy.text());
+    let confidence = report.confidence.map_or("not fitted: too few poses".to_owned(), |fit| {
+        let good = fit.sweeps - fit.bad;
+        format!("rejects {} of {} wrong poses, {} of {good} right ones", fit.bad_rejected, fit.bad, fit.good_rejected)
+    });
+    format!(
+        "place      {}\naccuracy   {accuracy}\nconfidence {confidence}\ndriven     {}\n{}{}\n",
+        report.place,
+        report.coverage_text(),
+        indented(&report.coverage.picture()),
+        report.limits_text()
+    )
+}
+
+fn indented(text: &str) -> String {
+    text.lines().map(|line| format!("           {line}\n")).collect()
+}
+
+/// Writes the model card and the report.
+fn write(config: &MapConfig, report: &MapReport) -> anyhow::Result<()> {
+    let mut card = ModelCard::new(
+        &format!("Scene head of {}", report.place),
+        "World coordinates of cells on the features of a frozen encoder, made by `agent map`.",
+    );
+    let data = format!("{} sweeps of {} drives", report.training_sweeps, config.drives.len());
+    card.trained(&report.run, &report.trained, &data, "cells");
+    card.row("file with confidence and scales", format_args!("SHA-256 `{}`", report.sha256));
+    card.row("copies of each sweep", report.copies);
+    card.row("encoder", format_args!("`{ENCODER_FILE}` beside the head"));
+    card.row("accuracy", report.held_out.map_or("not measured".to_owned(), |accuracy| accuracy.text()));
+    card.row("driven", report.coverage_text());
+    card.row("time of everything", format_args!("{:.0} s", report.seconds));
+    card.paragraph(&report.limits_text());
+    card.paragraph(&format!(
+        "Cells of {:.0} m with sweeps (#), north up:\n\n```\n{}```",
+        report.coverage.cell_m,
+        report.coverage.picture()
+    ));
+    card.write(&config.run.out).map_err(MapError::from)?;
+    let path = config.run.out.join(REPORT_FILE);
+    let json = serde_json::to_string_pretty(report)? + "\n";
+    support::atomic_file::write(&path, json.as_bytes()).with_context(|| path.display().to_string())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_place_is_named_after_its_folder() {
+        assert_eq!(name_of(Path::new("runs/my town/")), "my town");
+        assert_eq!(indented("#.\n##\n"), "           #.\n           ##\n");
+    }
+}

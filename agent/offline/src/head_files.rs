@@ -1,0 +1,134 @@
+//! Files of scene heads and their encoders, by path or by the name of a released one.
+
+use std::path::{Path, PathBuf};
+
+use localization::pgc::{SceneHead, SceneHeadConfig};
+use perception::weights::{Weights, WeightsError};
+
+/// Ending of weights files.
+const ENDING: &str = "safetensors";
+/// Name of the encoder beside its heads.
+pub const ENCODER_FILE: &str = "pgc-encoder.safetensors";
+/// Name of the weights in the folder of a training.
+const TRAINED_FILE: &str = "weights.safetensors";
+/// Folders of released weights: from the working directory, and from the folder of the programs (a checkout's
+/// `target/release`, or `bin` of an installation).
+const FROM_HERE: [&str; 2] = ["deploy/weights", "weights"];
+const FROM_PROGRAMS: [&str; 3] = ["../share/v2vloc/weights", "../../deploy/weights", "../weights"];
+
+/// Reasons why no file is chosen.
+#[derive(Debug, thiserror::Error)]
+pub enum HeadFileError {
+    /// There is no such file, and no such released head.
+    #[error("--head {head}: no such file or released head; released are {}", released.join(", "))]
+    NoHead {
+        /// The request.
+        head: String,
+        /// Names of the released heads.
+        released: Vec<String>,
+    },
+    /// No encoder belongs to the head.
+    #[error("{}: its encoder (SHA-256 {sha256}) is neither beside it nor among the released weights: --encoder FILE", head.display())]
+    NoEncoder {
+        /// The head.
+        head: PathBuf,
+        /// Digest in the head's metadata.
+        sha256: String,
+    },
+    /// A file cannot be read.
+    #[error(transparent)]
+    Weights(#[from] WeightsError),
+}
+
+/// The file of a head: a path, the folder of a training, or the name of a released one (`town1` or `pgc-town1`).
+///
+/// # Errors
+/// [`HeadFileError::NoHead`] with the names of the released heads.
+pub fn head_file(head: &str) -> Result<PathBuf, HeadFileError> {
+    let path = PathBuf::from(head);
+    if path.is_file() {
+        return Ok(path);
+    }
+    if path.is_dir() {
+        return Ok(path.join(TRAINED_FILE));
+    }
+    let folders = weights_folders();
+    let names = [format!("pgc-{head}.{ENDING}"), format!("{head}.{ENDING}")];
+    let mut files = folders.iter().flat_map(|folder| names.iter().map(move |name| folder.join(name)));
+    let released = || {
+        let files = folders.iter().flat_map(|folder| files_in(folder));
+        let stems = files.filter_map(|file| Some(file.file_stem()?.to_str()?.strip_prefix("pgc-")?.to_owned()));
+        stems.filter(|name| name != "encoder").collect()
+    };
+    files
+        .find(|file| file.is_file())
+        .ok_or_else(|| HeadFileError::NoHead { head: head.to_owned(), released: released() })
+}
+
+/// The encoder of a head: `pgc-encoder.safetensors` beside it, or the released one whose digest its metadata names.
+///
+/// # Errors
+/// [`HeadFileError`] when there is none, or the head cannot be read.
+pub fn encoder_of(head: &Path) -> Result<PathBuf, HeadFileError> {
+    let beside = head.with_file_name(ENCODER_FILE);
+    if beside.is_file() {
+        return Ok(beside);
+    }
+    let weights = Weights::load(head)?;
+    weights.check_kind(SceneHead::KIND)?;
+    let sha256 = weights.config::<SceneHeadConfig>()?.encoder_sha256;
+    let folders = head.parent().map(Path::to_owned).into_iter().chain(weights_folders());
+    let encoders = folders
+        .flat_map(|folder| files_in(&folder))
+        .filter(|file| file.file_stem().and_then(|stem| stem.to_str()).is_some_and(|stem| stem.contains("encoder")));
+    let is_named = |file: &PathBuf| Weights::load(file).is_ok_and(|weights| weights.sha256() == sha256);
+    let mut encoders = encoders.filter(is_named);
+    encoders.next().ok_or_else(|| HeadFileError::NoEncoder { head: head.to_owned(), sha256: sha256.clone() })
+}
+
+/// The released encoder, for a new head.
+#[must_use]
+pub fn released_encoder() -> Option<PathBuf> {
+    weights_folders().into_iter().map(|folder| folder.join(ENCODER_FILE)).find(|file| file.is_file())
+}
+
+/// Folders of released weights that exist.
+fn weights_folders() -> Vec<PathBuf> {
+    let programs = std::env::current_exe().ok().and_then(|exe| exe.parent().map(Path::to_owned));
+    let installed = programs.into_iter().flat_map(|folder| FROM_PROGRAMS.map(|name| folder.join(name)));
+    FROM_HERE.into_iter().map(PathBuf::from).chain(installed).filter(|folder| folder.is_dir()).collect()
+}
+
+/// Weights in a folder, in text order.
+fn files_in(folder: &Path) -> Vec<PathBuf> {
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
+    let mut files: Vec<PathBuf> =
+        entries.filter(|path| path.extension().is_some_and(|ending| ending == ENDING)).collect();
+    files.sort_unstable();
+    files
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_head_is_a_file_or_the_folder_of_a_training() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join(TRAINED_FILE);
+        std::fs::write(&file, "").unwrap();
+        for head in [&file, &folder.path().to_owned()] {
+            assert_eq!(head_file(head.to_str().unwrap()).unwrap(), file);
+        }
+        let message = head_file("town-that-nobody-drove").unwrap_err().to_string();
+        assert!(message.contains("--head town-that-nobody-drove: no such file or released head"), "{message}");
+    }
+
+    #[test]
+    fn the_encoder_beside_a_head_comes_first() {
+        let folder = tempfile::tempdir().unwrap();
+        let head = folder.path().join("a.safetensors");
+        std::fs::write(folder.path().join(ENCODER_FILE), "").unwrap();
+        assert_eq!(encoder_of(&head).unwrap(), folder.path().join(ENCODER_FILE));
+    }
+}

@@ -1,0 +1,105 @@
+//! Check of a new head on held-out sweeps, and examples of right and wrong poses for its confidence.
+//!
+//! Wrong poses come from mirrored sweeps: a street with left and right exchanged is another place, seen by the same LiDAR.
+
+use std::time::Instant;
+
+use nalgebra::Isometry3;
+use protocol::{PointCloud, Pose};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+use crate::evaluation::EvaluatedSweep;
+use crate::training::{SweepList, yaw};
+use localization::pgc::confidence::{BAD_M, Labelled};
+use localization::pgc::{Localizer, LocalizerError};
+
+/// Fewest examples of either kind; of fewer sweeps there are rotated and subsampled copies.
+pub(super) const LEAST_CHECKED: usize = 45;
+/// Largest rotation of a copy, radians.
+const TURN_RAD: f64 = 0.17;
+/// Smallest share of points in a copy.
+const KEEP: f64 = 0.7;
+
+/// Results on held-out sweeps.
+#[derive(Debug, Default)]
+pub(super) struct Check {
+    /// The sweeps as they are.
+    pub(super) sweeps: Vec<EvaluatedSweep>,
+    /// Poses of these, of copies and of mirrored sweeps, with their errors.
+    pub(super) labelled: Vec<Labelled>,
+}
+
+/// Localizes the sweeps of `list` and their mirror images, then copies of both until `deadline`; `progress` gets the
+/// number done and of all.
+///
+/// # Errors
+/// [`LocalizerError`] when the tensor library fails. Sweeps that cannot be read are left out and counted in `list`.
+pub(super) fn check(
+    localizer: &Localizer,
+    list: &SweepList,
+    seed: u64,
+    deadline: Instant,
+    progress: &mut dyn FnMut(usize, usize),
+) -> Result<Check, LocalizerError> {
+    let copies = LEAST_CHECKED.div_ceil(list.len().max(1));
+    let mut check = Check::default();
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    for number in 0..copies * list.len() {
+        let (copy, index) = (number / list.len(), number % list.len());
+        if copy > 0 && Instant::now() > deadline {
+            break;
+        }
+        progress(number, copies * list.len());
+        let Some((frame, scenario, stem)) = list.frame(index) else { continue };
+        let Some(truth) = frame.world_from_lidar else { continue };
+        let (cloud, truth) = match copy {
+            0 => (frame.points, truth),
+            _ => turned(&frame.points, &truth, &mut rng),
+        };
+        let localization = localizer.localize(&cloud)?;
+        let sweep = EvaluatedSweep { scenario, cav: frame.cav, stem, truth, localization };
+        check.labelled.extend(sweep.labelled());
+        let mirrored = EvaluatedSweep { localization: localizer.localize(&mirrored(&cloud))?, ..sweep.clone() };
+        // A straight street is its own mirror image: a pose near the true one is no example of a wrong pose.
+        check.labelled.extend(mirrored.labelled().filter(|labelled| labelled.error_m > BAD_M));
+        if copy == 0 {
+            check.sweeps.push(sweep);
+        }
+    }
+    Ok(check)
+}
+
+/// The sweep of a sensor that is rotated about the vertical by a random angle, with a part of the points.
+fn turned(cloud: &PointCloud, world_from_sensor: &Pose, rng: &mut impl Rng) -> (PointCloud, Pose) {
+    let turned_from_sensor = yaw(rng.random_range(-TURN_RAD..TURN_RAD));
+    let keep = rng.random_range(KEEP..1.0);
+    let turn: Isometry3<f32> = turned_from_sensor.cast();
+    let kept = cloud.xyzi.iter().filter(|_| rng.random_bool(keep)).map(|&[x, y, z, intensity]| {
+        let point = turn * nalgebra::Point3::new(x, y, z);
+        [point.x, point.y, point.z, intensity]
+    });
+    (PointCloud { xyzi: kept.collect() }, (world_from_sensor.isometry() * turned_from_sensor.inverse()).into())
+}
+
+fn mirrored(cloud: &PointCloud) -> PointCloud {
+    PointCloud { xyzi: cloud.xyzi.iter().map(|&[x, y, z, intensity]| [x, -y, z, intensity]).collect() }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_point_keeps_its_place_in_the_world_when_the_sensor_is_turned() {
+        let cloud = PointCloud { xyzi: vec![[10.0, -3.0, 1.0, 0.5]; 200] };
+        let pose = Pose::from_xyz_yaw([5.0, 6.0, 2.0], 0.7);
+        let (copy, turned_pose) = turned(&cloud, &pose, &mut ChaCha8Rng::seed_from_u64(3));
+        assert!((100..200).contains(&copy.len()));
+        let place =
+            |pose: &Pose, [x, y, z, _]: [f32; 4]| pose.isometry() * nalgebra::Point3::new(x, y, z).cast::<f64>();
+        let moved = place(&pose, cloud.xyzi[0]) - place(&turned_pose, copy.xyzi[0]);
+        assert!(moved.norm() < 1e-5, "{moved}");
+        assert_eq!(mirrored(&cloud).xyzi[0], [10.0, 3.0, 1.0, 0.5]);
+    }
+}

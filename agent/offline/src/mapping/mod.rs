@@ -1,0 +1,422 @@
+//! A head for a place, from drives with poses: held-out sweeps, training within a time, scales, confidence, accuracy.
+
+mod check;
+mod coverage;
+mod held_out;
+mod plan;
+mod report;
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use nalgebra::Vector3;
+
+pub use coverage::{Coverage, CoveredCell};
+pub use report::{HeldOutAccuracy, MapReport};
+
+use self::check::Check;
+use self::plan::{Plan, feature_bytes, too_little_memory};
+use crate::evaluation::LocalizationSummary;
+use crate::head_files::ENCODER_FILE;
+use crate::training::{
+    CELLS, FeatureCache, LocalizerTrainError, SceneReport, SceneSummary, SceneSweeps, SceneTrainConfig,
+    SweepAugmentation, SweepList, train_scene_on,
+};
+use localization::pgc::confidence::{CONFIDENCE_KEY, Confidence, ConfidenceModel, FitReport};
+use localization::pgc::{Localizer, LocalizerError, SceneEncoder};
+use perception::inference::Inference;
+use perception::int8::{SCALES_KEY, ScaleSearch};
+use perception::train::{Length, RunConfig, TrainingError};
+use perception::weights::{WeightsError, annotate};
+
+/// Sweeps that are encoded to measure their time.
+const PROBES: usize = 8;
+/// Batches of a pass over the cells, and the bounds of a batch: a small place has smaller ones, and so more steps.
+const BATCHES: usize = 40;
+const LEAST_BATCH: usize = 512;
+const MOST_BATCH: usize = 4096;
+/// Sweeps of the search for scales.
+const SCALE_SWEEPS: usize = 30;
+/// Largest share of good poses that the confidence may reject.
+const GOOD_LOSS: f64 = 0.01;
+/// Time between two checkpoints.
+const CHECKPOINT_EVERY: Duration = Duration::from_secs(120);
+
+/// Configuration of a map.
+#[derive(Debug, Clone)]
+pub struct MapConfig {
+    /// Data sets, splits or drives with poses, all in one frame.
+    pub drives: Vec<PathBuf>,
+    /// Name of the place.
+    pub place: String,
+    /// Weights of the encoder.
+    pub encoder: PathBuf,
+    /// Time of everything.
+    pub time: Duration,
+    /// Largest number of training sweeps.
+    pub most_sweeps: Option<usize>,
+    /// Folder, device, precision, threads and seed; its length is not used.
+    pub run: RunConfig,
+}
+
+/// Progress of a map.
+#[derive(Debug)]
+pub enum MapProgress {
+    /// A line that stays.
+    Note(String),
+    /// Seconds since the start, and what is being done.
+    At(f64, String),
+}
+
+/// Error that ends a map early.
+#[derive(Debug, thiserror::Error)]
+pub enum MapError {
+    /// No sweep has a pose.
+    #[error("{folders:?}: none of {sweeps} sweeps has a pose{}", first.as_ref().map(|first| format!("; first fault: {first}")).unwrap_or_default())]
+    NoPoses {
+        /// The drives.
+        folders: Vec<PathBuf>,
+        /// Number of sweeps.
+        sweeps: usize,
+        /// The first fault of a sweep.
+        first: Option<String>,
+    },
+    /// The features do not fit into the memory.
+    #[error("features of {sweeps} sweeps take {} MB, {} MB are free: --sweeps N uses fewer", needed >> 20, free >> 20)]
+    Memory {
+        /// Number of sweeps, copies included.
+        sweeps: usize,
+        /// Bytes needed.
+        needed: u64,
+        /// Bytes available.
+        free: u64,
+    },
+    /// A training failed, or data cannot be read.
+    #[error(transparent)]
+    Training(#[from] LocalizerTrainError),
+    /// The head cannot be loaded or run.
+    #[error(transparent)]
+    Localizer(#[from] LocalizerError),
+    /// The head's file cannot be completed.
+    #[error(transparent)]
+    Weights(#[from] WeightsError),
+    /// The encoder cannot be copied beside the head.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// Error of the operating system.
+        source: std::io::Error,
+    },
+}
+
+impl MapError {
+    /// True if the input is at fault.
+    #[must_use]
+    pub fn is_bad_input(&self) -> bool {
+        match self {
+            Self::NoPoses { .. } | Self::Memory { .. } => true,
+            Self::Training(error) => matches!(error, LocalizerTrainError::Read(_) | LocalizerTrainError::NoSweeps(_)),
+            Self::Localizer(_) | Self::Weights(_) | Self::Io { .. } => false,
+        }
+    }
+}
+
+/// Trains and checks a head; writes weights, encoder, checkpoint and curve into `config.run.out`.
+///
+/// # Errors
+/// [`MapError`]; a checkpoint may stay.
+pub fn make_map(config: &MapConfig, observe: &mut dyn FnMut(MapProgress)) -> Result<MapReport, MapError> {
+    let mut map = Map { config, started: Instant::now(), observe };
+    let sweeps = map.survey()?;
+    let plan = map.plan(&sweeps)?;
+    let training = Arc::new(sweeps.list.subset(&thinned(&sweeps.training, plan.training)));
+    let held_out = sweeps.list.subset(&thinned(&sweeps.held_out, plan.checked));
+    let coverage = sweeps.coverage(&thinned(&sweeps.training, plan.training));
+    let (summary, run) = map.train(&training, &plan)?;
+    map.copy_encoder()?;
+    let weights = summary.trained.weights.clone();
+    let activation_scales = map.quantise(&weights, &training)?;
+    let mut checked = map.check(&weights, &held_out)?;
+    let (confidence, sha256) = map.fit(&weights, &mut checked)?;
+    let mut data = training.data();
+    data.problems.extend(held_out.data().problems.into_iter().skip(data.problems.len()));
+    data.without_pose += sweeps.without_pose;
+    let accuracy = (!checked.sweeps.is_empty()).then(|| HeldOutAccuracy::of(&LocalizationSummary::of(&checked.sweeps)));
+    Ok(MapReport {
+        place: config.place.clone(),
+        sha256: sha256.unwrap_or_else(|| summary.trained.sha256.clone()),
+        training_sweeps: summary.sweeps / plan.copies.max(1),
+        copies: plan.copies,
+        held_out: accuracy,
+        confidence,
+        activation_scales,
+        coverage: coverage.ok_or_else(|| map.no_poses(&sweeps.list))?,
+        left_out: data.left_out(),
+        seconds: map.seconds(),
+        trained: summary.trained,
+        run,
+    })
+}
+
+/// `count` of some indices, evenly spread.
+fn thinned(indices: &[usize], count: usize) -> Vec<usize> {
+    let count = count.min(indices.len());
+    (0..count).map(|place| indices[place * indices.len() / count]).collect()
+}
+
+/// Sweeps with poses.
+struct Sweeps {
+    list: SweepList,
+    /// Drive and position of each sweep of the list, metres; `None` without a pose.
+    positions: Vec<(usize, Option<Vector3<f64>>)>,
+    training: Vec<usize>,
+    held_out: Vec<usize>,
+    without_pose: usize,
+}
+
+impl Sweeps {
+    /// Coverage of some sweeps.
+    fn coverage(&self, indices: &[usize]) -> Option<Coverage> {
+        let mut drives: Vec<Vec<Vector3<f64>>> = Vec::new();
+        let mut last = None;
+        for &index in indices {
+            let (drive, Some(position)) = self.positions[index] else { continue };
+            if last != Some(drive) {
+                drives.push(Vec::new());
+                last = Some(drive);
+            }
+            drives.last_mut()?.push(position);
+        }
+        Coverage::of(&drives)
+    }
+}
+
+struct Map<'a> {
+    config: &'a MapConfig,
+    started: Instant,
+    observe: &'a mut dyn FnMut(MapProgress),
+}
+
+impl Map<'_> {
+    fn seconds(&self) -> f64 {
+        self.started.elapsed().as_secs_f64()
+    }
+
+    fn note(&mut self, text: String) {
+        (self.observe)(MapProgress::Note(text));
+    }
+
+    fn at(&mut self, text: String) {
+        let seconds = self.seconds();
+        (self.observe)(MapProgress::At(seconds, text));
+    }
+
+    fn no_poses(&self, list: &SweepList) -> MapError {
+        let first = list.data().problems.into_iter().next();
+        MapError::NoPoses { folders: self.config.drives.clone(), sweeps: list.len(), first }
+    }
+
+    /// Reads the poses and holds sweeps out.
+    fn survey(&mut self) -> Result<Sweeps, MapError> {
+        let list = SweepList::open(&self.config.drives)?;
+        self.at(format!("reading the poses of {} sweeps", list.len()));
+        let positions: Vec<(usize, Option<Vector3<f64>>)> =
+            list.poses().into_iter().map(|(drive, pose)| (drive, pose.map(|pose| pose.translation.vector))).collect();
+        let (mut training, mut held) = (Vec::new(), Vec::new());
+        let drives = positions.iter().map(|(drive, _)| *drive).max().map_or(0, |last| last + 1);
+        for drive in 0..drives {
+            let of_drive = positions.iter().enumerate().filter(|(_, (of, _))| *of == drive);
+            let known: Vec<(usize, Vector3<f64>)> =
+                of_drive.filter_map(|(index, (_, position))| Some((index, (*position)?))).collect();
+            let path: Vec<Vector3<f64>> = known.iter().map(|(_, position)| *position).collect();
+            for ((index, _), is_held_out) in known.into_iter().zip(held_out::held_out(&path)) {
+                if is_held_out { held.push(index) } else { training.push(index) }
+            }
+        }
+        if training.is_empty() {
+            return Err(self.no_poses(&list));
+        }
+        let without_pose = list.len() - training.len() - held.len();
+        Ok(Sweeps { list, positions, training, held_out: held, without_pose })
+    }
+
+    /// Measures the time of a sweep, plans and announces.
+    fn plan(&mut self, sweeps: &Sweeps) -> Result<Plan, MapError> {
+        let run = &self.config.run;
+        let (encoder, _) = SceneEncoder::load(&self.config.encoder, run.device)?;
+        let wanted = self.config.most_sweeps.unwrap_or(usize::MAX).min(sweeps.training.len());
+        let probes = Arc::new(sweeps.list.subset(&thinned(&sweeps.training, PROBES)));
+        let unchanged = SweepAugmentation { copies: 1, turn_rad: 0.0, keep: 1.0 };
+        let began = Instant::now();
+        // The first sweeps are slower: they are not counted, unless there are no others.
+        let mut first_s = 0.0;
+        let first = 4.min(probes.len());
+        let mut progress = |done: usize, _: usize| {
+            if done == first {
+                first_s = began.elapsed().as_secs_f64();
+            }
+        };
+        FeatureCache::build(&probes, &encoder, unchanged, run, &mut progress).map_err(|error| match error {
+            LocalizerTrainError::NoSweeps(_) => self.no_poses(&probes),
+            error => error.into(),
+        })?;
+        let all_s = began.elapsed().as_secs_f64();
+        let sweep_s = match probes.len() - first {
+            0 => all_s / probes.len().max(1) as f64,
+            later => (all_s - first_s) / later as f64,
+        };
+        let left_s = self.config.time.as_secs_f64() - self.seconds();
+        let plan = Plan::new(wanted, sweeps.held_out.len(), sweep_s, left_s);
+        let encoded = plan.training * plan.copies;
+        let needed = feature_bytes(encoded, encoder.config().cell_channels());
+        if let Some(free) = too_little_memory(needed) {
+            return Err(MapError::Memory { sweeps: encoded, needed, free });
+        }
+        self.announce(sweeps, &plan, wanted);
+        Ok(plan)
+    }
+
+    fn announce(&mut self, sweeps: &Sweeps, plan: &Plan, wanted: usize) {
+        let Plan { training, copies, checked, encoding_s, check_s } = *plan;
+        let total_s = self.config.time.as_secs_f64();
+        if training < wanted {
+            let minutes = (total_s * wanted as f64 / training as f64 / 60.0).ceil();
+            self.note(format!(
+                "{training} of {wanted} training sweeps are used, evenly spread: there is no time for more; --minutes \
+                 {minutes:.0} would use all"
+            ));
+        }
+        let training_s = (total_s - self.seconds() - encoding_s - check_s).max(0.0);
+        let copies = if copies > 1 { format!(" in {copies} copies, rotated and thinned") } else { String::new() };
+        self.note(format!(
+            "{training} training sweeps{copies}, {checked} of {} held-out sweeps; encoding {encoding_s:.0} s, training \
+             {training_s:.0} s, check {check_s:.0} s: {:.1} min in all",
+            sweeps.held_out.len(),
+            total_s / 60.0
+        ));
+    }
+
+    fn train(&mut self, training: &Arc<SweepList>, plan: &Plan) -> Result<(SceneSummary, RunConfig), MapError> {
+        let left_s = (self.config.time.as_secs_f64() - self.seconds() - plan.check_s).max(1.0);
+        let run = RunConfig {
+            length: Length::Time(Duration::from_secs_f64(left_s)),
+            batch: (plan.training * plan.copies * CELLS / BATCHES).clamp(LEAST_BATCH, MOST_BATCH),
+            ..self.config.run.clone()
+        };
+        let classes = (plan.training / 12).clamp(4, 150).min(plan.training.max(1)) as i64;
+        let config = SceneTrainConfig {
+            init: None,
+            scenes: self.config.drives.clone(),
+            validation: Vec::new(),
+            validation_sweeps: 0,
+            encoder: self.config.encoder.clone(),
+            scene_name: self.config.place.clone(),
+            classes,
+            centres: (10 * classes).min(1400),
+            width: 448,
+            blocks: 3,
+            refiner: true,
+            augmentation: SweepAugmentation { copies: plan.copies, turn_rad: 10.0_f64.to_radians(), keep: 0.7 },
+            redundancy: None,
+            run: run.clone(),
+            validate_every: CHECKPOINT_EVERY,
+        };
+        let sweeps = SceneSweeps { training: Arc::clone(training), validation: None };
+        let started = self.started;
+        let observe = &mut *self.observe;
+        let mut tell = |report: &SceneReport| {
+            let text = match report {
+                SceneReport::Encoding(done, total) => format!("encoding, {done} of {total} sweeps"),
+                SceneReport::Classified(share) => {
+                    format!("{:.0} % of the sweeps are assigned to their part of the place", 100.0 * share)
+                }
+                SceneReport::Stepped { step, error_m, refined_m, .. } => {
+                    format!("training, step {step}, error of cells {error_m:.2} m, refined {refined_m:.2} m")
+                }
+                SceneReport::Encoded(_) | SceneReport::Validated(..) => return,
+            };
+            observe(MapProgress::At(started.elapsed().as_secs_f64(), text));
+        };
+        Ok((train_scene_on(&config, &sweeps, &mut tell)?, run))
+    }
+
+    /// Copies the encoder beside the head, so that the folder is all that is needed.
+    fn copy_encoder(&self) -> Result<(), MapError> {
+        let path = self.config.run.out.join(ENCODER_FILE);
+        let is_there = path.canonicalize().ok() == self.config.encoder.canonicalize().ok();
+        let copied = if is_there { Ok(0) } else { std::fs::copy(&self.config.encoder, &path) };
+        copied.map(|_| ()).map_err(|source| MapError::Io { path, source })
+    }
+
+    /// Searches the scales of activations; their number.
+    fn quantise(&mut self, weights: &std::path::Path, training: &SweepList) -> Result<usize, MapError> {
+        self.at("scales for 8-bit inference".to_owned());
+        let localizer = Localizer::load_without_confidence(&self.config.encoder, weights, Inference::FLOAT)?;
+        let mut search = ScaleSearch::default();
+        let all: Vec<usize> = (0..training.len()).collect();
+        for index in thinned(&all, SCALE_SWEEPS) {
+            if let Some((frame, ..)) = training.frame(index) {
+                localizer.observe(&frame.points, &mut search)?;
+            }
+        }
+        let scales = search.scales();
+        if !scales.is_empty() {
+            let text = serde_json::to_string(&scales).expect("scales are numbers");
+            annotate(weights, SCALES_KEY, &text)?;
+        }
+        Ok(scales.len())
+    }
+
+    fn check(&mut self, weights: &std::path::Path, held_out: &SweepList) -> Result<Check, MapError> {
+        let localizer = Localizer::load_without_confidence(&self.config.encoder, weights, Inference::default())?;
+        let started = self.started;
+        let observe = &mut *self.observe;
+        let mut progress = |done, all| {
+            let text = format!("checking, {done} of {all} sweeps");
+            observe(MapProgress::At(started.elapsed().as_secs_f64(), text));
+        };
+        let deadline = started + self.config.time;
+        Ok(check::check(&localizer, held_out, self.config.run.seed, deadline, &mut progress)?)
+    }
+
+    /// Fits the confidence, writes it into the head and applies it; the report and the new digest.
+    fn fit(
+        &mut self,
+        weights: &std::path::Path,
+        checked: &mut Check,
+    ) -> Result<(Option<FitReport>, Option<String>), MapError> {
+        match ConfidenceModel::fit(&checked.labelled, GOOD_LOSS) {
+            Ok((model, report)) => {
+                let text = serde_json::to_string(&model).expect("a model is numbers");
+                let sha256 = annotate(weights, CONFIDENCE_KEY, &text)?;
+                let confidence = Confidence::Calibrated(model);
+                checked.sweeps.iter_mut().for_each(|sweep| sweep.judge_again(&confidence));
+                Ok((Some(report), Some(sha256)))
+            }
+            Err(error) => {
+                self.note(format!("the confidence is not fitted: {error}"));
+                Ok((None, None))
+            }
+        }
+    }
+}
+
+impl From<TrainingError> for MapError {
+    fn from(error: TrainingError) -> Self {
+        Self::Training(error.into())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_thinned_list_is_even_and_never_longer() {
+        assert_eq!(thinned(&[2, 3, 5, 7, 11, 13], 3), [2, 5, 11]);
+        assert_eq!(thinned(&[2, 3], 9), [2, 3]);
+        assert_eq!(thinned(&[], 3), Vec::<usize>::new());
+    }
+}

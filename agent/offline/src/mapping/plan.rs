@@ -1,0 +1,97 @@
+//! Plan of a map: number of sweeps and time of each part, from the measured time of one sweep and the time there is.
+
+use std::fs;
+
+use super::check::LEAST_CHECKED;
+use crate::training::CELLS;
+
+/// Largest share of the time before the check that is spent on encoding.
+const ENCODING_SHARE: f64 = 0.5;
+/// Largest share of the time that the check takes.
+const CHECK_SHARE: f64 = 0.25;
+/// Most sweeps that the head is checked on.
+const MOST_CHECKED: usize = 200;
+/// Most passes that a small place gets, rotated and subsampled.
+const MOST_COPIES: usize = 40;
+/// Number of encoded sweeps from which no copies are needed.
+const ENOUGH_SWEEPS: usize = 150;
+/// Largest share of the free memory that features may take.
+const MEMORY_SHARE: f64 = 0.7;
+
+/// Sweeps and times of a map.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Plan {
+    /// Number of training sweeps.
+    pub(super) training: usize,
+    /// Encoded copies of each.
+    pub(super) copies: usize,
+    /// Number of held-out sweeps that are used.
+    pub(super) checked: usize,
+    /// Time of encoding, seconds.
+    pub(super) encoding_s: f64,
+    /// Time of the check, seconds.
+    pub(super) check_s: f64,
+}
+
+impl Plan {
+    /// Plan for `total_s` seconds; `sweep_s`: of one sweep, to read and encode.
+    pub(super) fn new(training: usize, held_out: usize, sweep_s: f64, total_s: f64) -> Self {
+        let sweep_s = sweep_s.max(1e-4);
+        // Each held-out sweep is localized as it is and mirrored; the localization costs as much as the encoding.
+        let checked_s = |count: usize| 4.0 * sweep_s * count as f64;
+        let most_checked = (0.2 * total_s / checked_s(1)) as usize;
+        let checked = held_out.min(MOST_CHECKED).min(most_checked.max(10));
+        let check_s = checked_s(if held_out > 0 { checked.max(LEAST_CHECKED) } else { 0 }).min(CHECK_SHARE * total_s);
+        let affordable = ((total_s - check_s).max(0.0) * ENCODING_SHARE / sweep_s) as usize;
+        let copies = (ENOUGH_SWEEPS / training.max(1)).clamp(1, MOST_COPIES);
+        let copies = copies.min((affordable / training.max(1)).max(1));
+        let training = training.min(affordable.max(1));
+        Self { training, copies, checked, encoding_s: (training * copies) as f64 * sweep_s, check_s }
+    }
+}
+
+/// Bytes that the features of sweeps take: half precision, and targets.
+pub(super) fn feature_bytes(sweeps: usize, channels: i64) -> u64 {
+    sweeps as u64 * CELLS as u64 * (2 * channels.unsigned_abs() + 40)
+}
+
+/// Free memory and the bytes that are needed, if these are too many; `None` if it is enough, or unknown.
+pub(super) fn too_little_memory(needed: u64) -> Option<u64> {
+    let free = available_memory(&fs::read_to_string("/proc/meminfo").ok()?)?;
+    (needed as f64 > MEMORY_SHARE * free as f64).then_some(free)
+}
+
+/// Available memory by Linux's own estimate, bytes.
+fn available_memory(meminfo: &str) -> Option<u64> {
+    let line = meminfo.lines().find_map(|line| line.strip_prefix("MemAvailable:"))?;
+    Some(line.split_ascii_whitespace().next()?.parse::<u64>().ok()? * 1024)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn all_sweeps_are_used_if_there_is_time_and_otherwise_as_many_as_fit() {
+        let plan = Plan::new(600, 80, 0.1, 600.0);
+        assert_eq!((plan.training, plan.copies, plan.checked), (600, 1, 80));
+        assert!((plan.encoding_s - 60.0).abs() < 1e-9 && (plan.check_s - 32.0).abs() < 1e-9);
+        let short = Plan::new(16_000, 2_000, 0.1, 600.0);
+        assert!(short.training < 3_000 && short.encoding_s <= 300.0 && short.check_s <= 120.0, "{short:?}");
+    }
+
+    #[test]
+    fn few_sweeps_are_copied() {
+        let plan = Plan::new(3, 1, 0.1, 600.0);
+        assert_eq!((plan.training, plan.copies, plan.checked), (3, 40, 1));
+        assert!(Plan::new(3, 1, 10.0, 60.0).copies <= 2);
+    }
+
+    #[test]
+    fn memory_is_compared_with_what_is_free() {
+        assert_eq!(available_memory("MemTotal: 9 kB\nMemAvailable:    2048 kB\n"), Some(2 << 20));
+        assert_eq!(feature_bytes(10, 448), 10 * 400 * 936);
+        assert_eq!(too_little_memory(1), None);
+        assert!(too_little_memory(u64::MAX).is_some());
+    }
+}

@@ -1,0 +1,250 @@
+//! Single point clouds: files by path, read as their data set stores them if they lie in one.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use protocol::PointCloud;
+
+use super::points::{SweepStorage, Sweeps};
+use super::{OpenOptions, ReadError, Scenario, files, single_vehicle_id};
+use crate::pcd::PcdCloud;
+
+/// Endings of files of points.
+const ENDINGS: [&str; 4] = ["pcd", "ply", "npy", "bin"];
+/// Folders of sweeps whose files are readable only with the rest of their data set: NCLT and Oxford.
+const SEQUENCE_FOLDERS: [&str; 2] = ["velodyne_sync", "velodyne_left"];
+
+/// A file of one sweep, and its reader.
+#[derive(Debug, Clone)]
+pub struct CloudFile {
+    path: PathBuf,
+    source: Source,
+}
+
+#[derive(Debug, Clone)]
+enum Source {
+    /// A frame of a data set.
+    Frame { scenario: Arc<Scenario>, agent: usize, tick: usize },
+    /// A file by itself, with the others of its folder.
+    File(Arc<Sweeps>),
+}
+
+/// Points of one file, right-handed if it lies in a data set, else as in the file.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Cloud {
+    /// The points in the LiDAR frame.
+    pub points: PointCloud,
+    /// Number of points that were left out: not finite, or exactly at the origin (rays without a return).
+    pub left_out: usize,
+    /// True if a data set states its handedness, which has been removed.
+    pub is_of_data_set: bool,
+}
+
+/// Files at paths, each a file or a folder: of a folder its files of points in text order, or all sweeps of the data set
+/// in it.
+#[must_use]
+pub fn clouds_at(paths: &[PathBuf]) -> Vec<Result<CloudFile, ReadError>> {
+    let mut found = Vec::new();
+    for path in paths {
+        match listed(path) {
+            Ok(clouds) => found.extend(clouds.into_iter().map(Ok)),
+            Err(error) => found.push(Err(error)),
+        }
+    }
+    let mut folders = Folders::of(found.iter().flatten());
+    found.into_iter().map(|listed| listed.map(|listed| folders.source_of(listed))).collect()
+}
+
+/// Files of points directly in a folder, in text order.
+pub(super) fn clouds_in(dir: &Path) -> Result<Vec<PathBuf>, ReadError> {
+    let paths = files::list(dir)?.files.into_iter().map(|name| dir.join(name));
+    Ok(paths.filter(|path| is_cloud(path)).collect())
+}
+
+fn is_cloud(path: &Path) -> bool {
+    let ending = path.extension().and_then(|ending| ending.to_str());
+    ending.is_some_and(|ending| ENDINGS.iter().any(|known| ending.eq_ignore_ascii_case(known)))
+}
+
+/// A listed file.
+enum Listed {
+    File(PathBuf),
+    Known(CloudFile),
+}
+
+fn listed(path: &Path) -> Result<Vec<Listed>, ReadError> {
+    let about = std::fs::metadata(path).map_err(|error| ReadError::io(path, error))?;
+    if !about.is_dir() {
+        return Ok(vec![Listed::File(path.to_owned())]);
+    }
+    let clouds = clouds_in(path)?;
+    if !clouds.is_empty() {
+        return Ok(clouds.into_iter().map(Listed::File).collect());
+    }
+    let sweeps: Vec<Listed> = crate::open(path)?.scenarios.into_iter().flat_map(frames_of).map(Listed::Known).collect();
+    match sweeps.is_empty() {
+        true => Err(ReadError::malformed(path, "no cloud in it: expected files .pcd, .ply, .npy or .bin")),
+        false => Ok(sweeps),
+    }
+}
+
+/// All sweeps of a scenario.
+fn frames_of(scenario: Scenario) -> Vec<CloudFile> {
+    let scenario = Arc::new(scenario);
+    let all = (0..scenario.agents.len()).flat_map(|agent| (0..scenario.ticks.len()).map(move |tick| (agent, tick)));
+    let file = |(agent, tick)| {
+        let path = scenario.points_path(agent, tick, None).ok()?;
+        Some(CloudFile { path, source: Source::Frame { scenario: Arc::clone(&scenario), agent, tick } })
+    };
+    all.filter_map(file).collect()
+}
+
+/// Readers of the folders that hold single files.
+struct Folders {
+    alone: BTreeMap<PathBuf, Arc<Sweeps>>,
+    /// Frames by path, of the data sets opened so far.
+    scenes: BTreeMap<PathBuf, BTreeMap<PathBuf, CloudFile>>,
+}
+
+impl Folders {
+    fn of<'a>(listed: impl Iterator<Item = &'a Listed>) -> Self {
+        let mut files: BTreeMap<PathBuf, Vec<PathBuf>> = BTreeMap::new();
+        for listed in listed {
+            if let Listed::File(path) = listed {
+                files.entry(folder_of(path)).or_default().push(path.clone());
+            }
+        }
+        let sweeps = |files: Vec<PathBuf>| {
+            Arc::new(Sweeps::of_single_vehicle(SweepStorage::ByName, files, &OpenOptions::default()))
+        };
+        let alone = files.into_iter().map(|(folder, files)| (folder, sweeps(files))).collect();
+        Self { alone, scenes: BTreeMap::new() }
+    }
+
+    fn source_of(&mut self, listed: Listed) -> CloudFile {
+        let path = match listed {
+            Listed::Known(file) => return file,
+            Listed::File(path) => path,
+        };
+        let known = scene_of(&path).and_then(|scene| {
+            let frames = self.scenes.entry(scene.clone()).or_insert_with(|| {
+                let scenarios = crate::open(&scene).map(|dataset| dataset.scenarios).unwrap_or_default();
+                scenarios.into_iter().flat_map(frames_of).map(|file| (canonical(&file.path), file)).collect()
+            });
+            frames.get(&canonical(&path)).cloned()
+        });
+        let alone = self.alone.get(&folder_of(&path)).cloned().unwrap_or_default();
+        known.map_or(CloudFile { path: path.clone(), source: Source::File(alone) }, |known| CloudFile { path, ..known })
+    }
+}
+
+fn folder_of(path: &Path) -> PathBuf {
+    path.parent().unwrap_or(path).to_owned()
+}
+
+fn canonical(path: &Path) -> PathBuf {
+    path.canonicalize().unwrap_or_else(|_| path.to_owned())
+}
+
+/// The scenario that a file belongs to, by the files beside it: OPV2V and its relatives have a YAML beside each sweep.
+fn scene_of(path: &Path) -> Option<PathBuf> {
+    let path = canonical(path);
+    let folder = path.parent()?;
+    let is_of_sequence = SEQUENCE_FOLDERS.iter().any(|name| folder.ends_with(name));
+    // Sweeps of another weather are variants: `000069_fog.pcd` beside `000069.yaml`.
+    let is_frame = path.with_extension("yaml").is_file();
+    (is_frame || is_of_sequence).then(|| folder.parent().map(Path::to_owned)).flatten()
+}
+
+impl CloudFile {
+    /// Path of the file.
+    #[must_use]
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Reads the points.
+    ///
+    /// # Errors
+    /// [`ReadError`] when the file cannot be read, is malformed or holds no points that a LiDAR measures: in this case
+    /// with the exceeded limit.
+    pub fn read(&self) -> Result<Cloud, ReadError> {
+        let PcdCloud { mut points, dropped, .. } = match &self.source {
+            Source::Frame { scenario, agent, tick } => scenario.load_points(*agent, *tick, None)?,
+            Source::File(sweeps) => sweeps.read(&single_vehicle_id(), &self.path)?,
+        };
+        let before = points.len();
+        points.xyzi.retain(|&[x, y, z, _]| [x, y, z] != [0.0; 3]);
+        let left_out = dropped + before - points.len();
+        let mut plausibility = super::Plausibility::default();
+        plausibility.add(&points);
+        if let Some(fault) = plausibility.fault() {
+            let reason = format!("{fault}; a cloud is in the LiDAR frame, in metres");
+            return Err(ReadError::malformed(&self.path, reason));
+        }
+        Ok(Cloud { points, left_out, is_of_data_set: matches!(self.source, Source::Frame { .. }) })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use super::*;
+
+    const POINTS: [[f32; 3]; 3] = [[1.0, 2.0, 3.0], [0.0, 0.0, 0.0], [4.0, -5.0, 1.5]];
+
+    fn ascii_pcd(points: &[[f32; 3]]) -> String {
+        let head = format!("FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH {}\nHEIGHT 1\nDATA ascii\n", points.len());
+        points.iter().fold(head, |text, [x, y, z]| format!("{text}{x} {y} {z}\n"))
+    }
+
+    fn xyz(file: &CloudFile) -> Vec<[f32; 3]> {
+        file.read().unwrap().points.xyzi.iter().map(|&[x, y, z, _]| [x, y, z]).collect()
+    }
+
+    #[test]
+    fn files_and_folders_are_listed_and_a_bad_one_is_an_error_of_its_own() {
+        let dir = tempfile::tempdir().unwrap();
+        let folder = dir.path().join("clouds");
+        fs::create_dir(&folder).unwrap();
+        fs::write(folder.join("a.pcd"), ascii_pcd(&POINTS)).unwrap();
+        fs::write(folder.join("b.npy"), "no array").unwrap();
+        fs::write(folder.join("notes.md"), "").unwrap();
+        let none = dir.path().join("none.pcd");
+        let files = clouds_at(&[folder.clone(), none.clone(), folder.join("a.pcd")]);
+        assert_eq!(files.len(), 4);
+        let first = files[0].as_ref().unwrap();
+        assert_eq!(xyz(first), [POINTS[0], POINTS[2]], "no return lies at the origin");
+        assert_eq!((first.read().unwrap().left_out, first.read().unwrap().is_of_data_set), (1, false));
+        assert!(files[1].as_ref().unwrap().read().unwrap_err().to_string().contains("b.npy: it does not begin"));
+        assert!(files[2].as_ref().unwrap_err().to_string().contains("none.pcd"));
+        assert_eq!(files[3].as_ref().unwrap().path(), folder.join("a.pcd"));
+    }
+
+    #[test]
+    fn a_file_of_a_left_handed_data_set_is_mirrored() {
+        let dir = tempfile::tempdir().unwrap();
+        let agent = dir.path().join("scene/7");
+        fs::create_dir_all(&agent).unwrap();
+        fs::write(agent.join("000069.pcd"), ascii_pcd(&POINTS)).unwrap();
+        fs::write(agent.join("000069.yaml"), "lidar_pose: [0, 0, 0, 0, 0, 0]\nvehicles: {}\n").unwrap();
+        for path in [agent.join("000069.pcd"), dir.path().to_owned()] {
+            let file = clouds_at(&[path]).remove(0).unwrap();
+            assert_eq!(xyz(&file), [[1.0, -2.0, 3.0], [4.0, 5.0, 1.5]]);
+            assert!(file.read().unwrap().is_of_data_set);
+        }
+    }
+
+    #[test]
+    fn points_of_a_map_are_refused_with_the_limit() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("map.pcd");
+        fs::write(&path, ascii_pcd(&[[450_000.0, 5_400_000.0, 110.0]])).unwrap();
+        let message = clouds_at(&[path]).remove(0).unwrap().read().unwrap_err().to_string();
+        assert!(
+            message.contains("0.0 % of the points lie within 300 m") && message.ends_with("LiDAR frame, in metres")
+        );
+    }
+}

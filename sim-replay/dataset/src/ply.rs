@@ -1,0 +1,250 @@
+//! PLY point files: ASCII and binary in either byte order, as CloudCompare, Open3D, MeshLab and PCL write them.
+//!
+//! The element `vertex` holds the points: properties `x`, `y`, `z`, and an intensity by any of its usual names. Other
+//! properties and elements are skipped. Points stay in the frame of the file.
+
+use crate::pcd::{INTENSITY, IntensityKind, IntensityOrigin, PcdCloud};
+use crate::scalar::{Scalar, ScalarKind};
+
+/// Longest header that is read, bytes.
+const MAX_HEADER: usize = 64 << 10;
+/// Most properties of an element.
+const MAX_PROPERTIES: usize = 256;
+
+/// Storage of the numbers.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Storage {
+    Ascii,
+    LittleEndian,
+    BigEndian,
+}
+
+/// Elements of one kind.
+#[derive(Debug)]
+struct Element {
+    name: String,
+    count: usize,
+    properties: Vec<(String, Scalar)>,
+    /// Name of the first list: elements with lists have no fixed size.
+    list: Option<String>,
+}
+
+impl Element {
+    fn stride(&self) -> usize {
+        self.properties.iter().map(|(_, scalar)| scalar.size).sum()
+    }
+
+    /// Index of a property, by any of the names, the first preferred.
+    fn find(&self, names: &[&str]) -> Option<usize> {
+        names.iter().find_map(|name| self.properties.iter().position(|(found, _)| found.eq_ignore_ascii_case(name)))
+    }
+}
+
+/// Reads a PLY file in memory; intensities are as stored.
+///
+/// # Errors
+/// The fault with the found and the expected value. No allocation relies on the header alone.
+pub(super) fn decode(bytes: &[u8]) -> Result<PcdCloud, String> {
+    let (storage, elements, body) = header(bytes)?;
+    let place = elements.iter().position(|element| element.name == "vertex");
+    let (before, vertex) =
+        place.and_then(|place| Some((elements.get(..place)?, elements.get(place)?))).ok_or_else(|| {
+            let names: Vec<&str> = elements.iter().map(|element| element.name.as_str()).collect();
+            format!("no element vertex, there are {names:?}")
+        })?;
+    if let Some(list) = &vertex.list {
+        return Err(format!("element vertex has the list {list:?}, expected numbers only"));
+    }
+    let coordinate = |name: &str| vertex.find(&[name]).ok_or_else(|| format!("element vertex has no property {name}"));
+    let columns = [Some(coordinate("x")?), Some(coordinate("y")?), Some(coordinate("z")?), vertex.find(&INTENSITY)];
+    let points = match storage {
+        Storage::Ascii => ascii(vertex, before, body, &columns)?,
+        Storage::LittleEndian | Storage::BigEndian => binary(vertex, before, body, &columns)?,
+    };
+    let [.., intensity] = columns;
+    let intensity = intensity.and_then(|index| vertex.properties.get(index)).map(|(name, scalar)| {
+        IntensityOrigin::stored(name, if scalar.is_byte() { IntensityKind::Byte } else { IntensityKind::Number })
+    });
+    let form = if storage == Storage::Ascii { "PLY, ascii" } else { "PLY, binary" };
+    Ok(PcdCloud { intensity, form, ..PcdCloud::of_finite(points, Vec::new()) })
+}
+
+/// Storage, elements, and the bytes behind the header.
+fn header(bytes: &[u8]) -> Result<(Storage, Vec<Element>, &[u8]), String> {
+    const END: &[u8] = b"end_header";
+    let start = bytes.get(..bytes.len().min(MAX_HEADER)).unwrap_or_default();
+    if !start.starts_with(b"ply") {
+        return Err("the first line is not ply".to_owned());
+    }
+    let end = start.windows(END.len()).position(|window| window == END).ok_or("no line end_header")?;
+    let (text, rest) = bytes.split_at(end);
+    let body = match rest.get(END.len()..).unwrap_or_default() {
+        [b'\r', b'\n', body @ ..] | [b'\n', body @ ..] => body,
+        body => body,
+    };
+    let text = String::from_utf8_lossy(text);
+    let (mut storage, mut elements) = (None, Vec::<Element>::new());
+    for (number, line) in (1..).zip(text.lines()) {
+        let words: Vec<&str> = line.split_ascii_whitespace().collect();
+        let fault = |reason: String| format!("line {number}: {reason}");
+        match *words {
+            ["format", name, _] => storage = Some((name.to_owned(), number)),
+            ["element", name, count] => {
+                let count = count.parse().map_err(|_| fault(format!("{count:?} is no number of elements")))?;
+                elements.push(Element { name: name.to_owned(), count, properties: Vec::new(), list: None });
+            }
+            ["property", "list", _, _, name] => match elements.last_mut() {
+                Some(element) => drop(element.list.get_or_insert_with(|| name.to_owned())),
+                None => return Err(fault("a property before the first element".to_owned())),
+            },
+            ["property", kind, name] => {
+                let scalar = scalar_of(kind).ok_or_else(|| fault(format!("{kind:?} is no type of a number")))?;
+                let element = elements.last_mut().ok_or_else(|| fault("a property before the first element".into()))?;
+                if element.properties.len() >= MAX_PROPERTIES {
+                    return Err(fault(format!("more than {MAX_PROPERTIES} properties")));
+                }
+                element.properties.push((name.to_owned(), scalar));
+            }
+            _ => {}
+        }
+    }
+    let storage = match storage.as_ref().map(|(name, _)| name.as_str()) {
+        Some("ascii") => Storage::Ascii,
+        Some("binary_little_endian") => Storage::LittleEndian,
+        Some("binary_big_endian") => Storage::BigEndian,
+        Some(other) => {
+            return Err(format!("format {other:?}, expected ascii, binary_little_endian or binary_big_endian"));
+        }
+        None => return Err("no line format".to_owned()),
+    };
+    let properties = elements.iter_mut().flat_map(|element| &mut element.properties);
+    properties.for_each(|(_, scalar)| scalar.is_big_endian = storage == Storage::BigEndian);
+    Ok((storage, elements, body))
+}
+
+fn scalar_of(name: &str) -> Option<Scalar> {
+    let (kind, size) = match name {
+        "char" | "int8" => (ScalarKind::Signed, 1),
+        "uchar" | "uint8" => (ScalarKind::Unsigned, 1),
+        "short" | "int16" => (ScalarKind::Signed, 2),
+        "ushort" | "uint16" => (ScalarKind::Unsigned, 2),
+        "int" | "int32" => (ScalarKind::Signed, 4),
+        "uint" | "uint32" => (ScalarKind::Unsigned, 4),
+        "float" | "float32" => (ScalarKind::Float, 4),
+        "double" | "float64" => (ScalarKind::Float, 8),
+        _ => return None,
+    };
+    Some(Scalar { kind, size, is_big_endian: false })
+}
+
+#[expect(clippy::cast_possible_truncation, reason = "rounded to f32")]
+fn ascii(
+    vertex: &Element,
+    before: &[Element],
+    body: &[u8],
+    columns: &[Option<usize>; 4],
+) -> Result<Vec<[f32; 4]>, String> {
+    let skipped = before.iter().fold(0_usize, |sum, element| sum.saturating_add(element.count));
+    let text = String::from_utf8_lossy(body);
+    let lines = text.lines().filter(|line| !line.trim().is_empty()).skip(skipped);
+    let mut points = Vec::new();
+    for (index, line) in lines.take(vertex.count).enumerate() {
+        let words: Vec<&str> = line.split_ascii_whitespace().collect();
+        let mut point = [0.0; 4];
+        for (value, column) in point.iter_mut().zip(columns) {
+            let Some(column) = column else { continue };
+            let word = words.get(*column).ok_or_else(|| {
+                format!("vertex {index}: {} numbers, expected {}", words.len(), vertex.properties.len())
+            })?;
+            *value = word.parse::<f64>().map_err(|_| format!("vertex {index}: {word:?} is no number"))? as f32;
+        }
+        points.push(point);
+    }
+    match points.len() {
+        found if found == vertex.count => Ok(points),
+        found => Err(format!("{} vertices stated, {found} found: the file is cut off", vertex.count)),
+    }
+}
+
+#[expect(clippy::cast_possible_truncation, reason = "rounded to f32")]
+fn binary(
+    vertex: &Element,
+    before: &[Element],
+    body: &[u8],
+    columns: &[Option<usize>; 4],
+) -> Result<Vec<[f32; 4]>, String> {
+    let mut skipped = 0_usize;
+    for element in before {
+        if let Some(list) = &element.list {
+            let name = &element.name;
+            return Err(format!("element {name} before the vertices has the list {list:?}: their place is unknown"));
+        }
+        skipped = skipped.saturating_add(element.count.saturating_mul(element.stride()));
+    }
+    let stride = vertex.stride();
+    let body = body.get(skipped..).unwrap_or_default();
+    let Some(body) = vertex.count.checked_mul(stride).and_then(|length| body.get(..length)) else {
+        let (count, found) = (vertex.count, body.len());
+        return Err(format!("{count} vertices of {stride} bytes stated, {found} bytes found: the file is cut off"));
+    };
+    let column = |index: usize| {
+        let first: usize = vertex.properties.iter().take(index).map(|(_, scalar)| scalar.size).sum();
+        vertex.properties.get(index).map(|(_, scalar)| (first, *scalar))
+    };
+    let places = columns.map(|index| index.and_then(column));
+    let point = |bytes: &[u8]| {
+        places.map(|place| place.and_then(|(first, scalar)| scalar.read(bytes.get(first..)?)).map_or(0.0, |v| v as f32))
+    };
+    Ok(body.chunks_exact(stride.max(1)).map(point).collect())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const HEAD: &str = "comment made by hand\nelement vertex 2\nproperty double x\nproperty double y\n\
+                        property double z\nproperty uchar red\nproperty uint16 scalar_Intensity\n";
+
+    fn file(format: &str, body: &[u8]) -> Vec<u8> {
+        let head = format!("ply\nformat {format} 1.0\n{HEAD}element face 0\nproperty list uchar int v\nend_header\n");
+        [head.as_bytes(), body].concat()
+    }
+
+    fn body(double: fn(f64) -> [u8; 8], short: fn(u16) -> [u8; 2]) -> Vec<u8> {
+        let point = |x: f64, intensity| [&double(x)[..], &double(-2.0), &double(3.5), &[9], &short(intensity)].concat();
+        [point(1.25, 7), point(f64::NAN, 8)].concat()
+    }
+
+    #[test]
+    fn all_storages_give_the_same_points() {
+        let files = [
+            file("binary_little_endian", &body(f64::to_le_bytes, u16::to_le_bytes)),
+            file("binary_big_endian", &body(f64::to_be_bytes, u16::to_be_bytes)),
+            file("ascii", b"1.25 -2 3.5e0 9 7\nnan -2 3.5 9 8\n"),
+        ];
+        for file in files {
+            let cloud = decode(&file).unwrap();
+            assert_eq!(cloud.points.xyzi, [[1.25, -2.0, 3.5, 7.0]]);
+            assert_eq!((cloud.dropped, cloud.intensity.unwrap().field.as_str()), (1, "scalar_Intensity"));
+        }
+    }
+
+    #[test]
+    fn faults_are_named_with_both_values() {
+        let message = |bytes: &[u8]| decode(bytes).unwrap_err();
+        assert_eq!(message(b"plum"), "no line end_header");
+        assert_eq!(message(b"PLY\n"), "the first line is not ply");
+        let cut = file("binary_little_endian", &[0; 53]);
+        assert_eq!(message(&cut), "2 vertices of 27 bytes stated, 53 bytes found: the file is cut off");
+        assert!(message(&file("ascii", b"1 2 3 4 5\n")).starts_with("2 vertices stated, 1 found"));
+        assert_eq!(message(&file("ascii", b"1 2 3 4 5\n1 2\n")), "vertex 1: 2 numbers, expected 5");
+        assert!(message(&file("binary", b"")).starts_with("format \"binary\", expected ascii"));
+        let huge = b"ply\nformat binary_little_endian 1.0\nelement vertex 18446744073709551615\nproperty float x\n\
+                     property float y\nproperty float z\nend_header\n";
+        assert!(message(huge).contains("the file is cut off"));
+        assert_eq!(
+            message(b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n"),
+            "element vertex has no property x"
+        );
+    }
+}
