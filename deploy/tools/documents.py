@@ -87,10 +87,12 @@ class Block:
         return None
 
     def command(self) -> str:
+        """The text for bash: ends at the first command whose exit code is not accepted."""
         text = self.text
         for old, new in self.replacements:
             text = text.replace(old, new)
-        return text
+        accepted = " || ".join(f"[ $code = {code} ]" for code in self.codes)
+        return f"trap 'code=$?; {accepted} || exit $code' ERR\n{text}"
 
 
 def blocks(page: pathlib.Path) -> list[Block]:

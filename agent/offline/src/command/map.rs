@@ -17,7 +17,7 @@ use super::train::options::check_folders;
 /// Name of the report beside the weights.
 const REPORT_FILE: &str = "map.json";
 
-/// Make a head for a place from drives through it, with which vehicles find themselves there (agent locate, agent run).
+/// Make a head for a place from drives through it, with which vehicles are localized there (agent locate, agent run).
 ///
 /// Drives are data sets in any layout with poses, or folders of clouds with a file of poses (`sim-replay inspect` lists
 /// them); all poses are in one frame, which becomes that of the map. Drive every road, wide ones in both directions: roads
