@@ -34,7 +34,11 @@ enum Command {
 
 /// Runs a subcommand.
 pub(crate) fn run(cli: Cli) -> ExitCode {
-    let kept = malloc_settings::ensure(&malloc_settings::KEPT_MEMORY).context("cannot execute this program again");
+    let kept = match cli.command {
+        // Kept memory pays off over many frames; a second start costs as much time as a cloud takes.
+        Command::Locate(_) => Ok(()),
+        _ => malloc_settings::ensure(&malloc_settings::KEPT_MEMORY).context("cannot execute this program again"),
+    };
     let outcome = kept.and_then(|()| match cli.command {
         Command::Eval(args) => command::eval::run(&args),
         Command::Localize(args) => command::localize::run(&args),

@@ -152,7 +152,6 @@ fn scene_of(path: &Path) -> Option<PathBuf> {
     let path = canonical(path);
     let folder = path.parent()?;
     let is_of_sequence = SEQUENCE_FOLDERS.iter().any(|name| folder.ends_with(name));
-    // Sweeps of another weather are variants: `000069_fog.pcd` beside `000069.yaml`.
     let is_frame = path.with_extension("yaml").is_file();
     (is_frame || is_of_sequence).then(|| folder.parent().map(Path::to_owned)).flatten()
 }

@@ -232,7 +232,7 @@ mod tests {
     #[test]
     fn faults_are_named_with_both_values() {
         let message = |bytes: &[u8]| decode(bytes).unwrap_err();
-        assert_eq!(message(b"plum"), "no line end_header");
+        assert_eq!(message(b"ply\n"), "no line end_header");
         assert_eq!(message(b"PLY\n"), "the first line is not ply");
         let cut = file("binary_little_endian", &[0; 53]);
         assert_eq!(message(&cut), "2 vertices of 27 bytes stated, 53 bytes found: the file is cut off");

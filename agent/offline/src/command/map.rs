@@ -50,7 +50,7 @@ pub(crate) struct Args {
     /// Device to train on.
     #[arg(long, value_enum, default_value_t)]
     device: ComputeDevice,
-    /// Threads of the network on the CPU [default: one for each core].
+    /// Threads of the network on the CPU [default: half as many as cores].
     #[arg(long, value_parser = clap::value_parser!(u16).range(1..=256))]
     threads: Option<u16>,
     /// Overwrite the map in --out.
@@ -102,7 +102,7 @@ impl Args {
         let missing = || BadInput::new("no released encoder is found: --encoder FILE");
         let encoder = self.encoder.clone().or_else(released_encoder).ok_or_else(missing)?;
         let cores = std::thread::available_parallelism().map_or(1, usize::from);
-        let threads = self.threads.map_or(cores.min(16), usize::from);
+        let threads = self.threads.map_or((cores / 2).clamp(1, 16), usize::from);
         tch::set_num_threads(i32::try_from(threads).unwrap_or(1));
         let device = self.device.open().map_err(|missing| BadInput::new(format!("--device cuda: {missing}")))?;
         Ok(MapConfig {

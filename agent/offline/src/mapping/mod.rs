@@ -35,7 +35,7 @@ const PROBES: usize = 8;
 /// Batches of a pass over the cells, and the bounds of a batch: a small place has smaller ones, and so more steps.
 const BATCHES: usize = 40;
 const LEAST_BATCH: usize = 512;
-const MOST_BATCH: usize = 4096;
+const MOST_BATCH: usize = 1024;
 /// Sweeps of the search for scales.
 const SCALE_SWEEPS: usize = 30;
 /// Largest share of good poses that the confidence may reject.
