@@ -21,6 +21,19 @@ pub enum VehicleTopic {
     Markers,
 }
 
+impl VehicleTopic {
+    /// Last part of its name.
+    fn name(self) -> &'static str {
+        match self {
+            Self::Pose => "pose",
+            Self::Odometry => "odometry",
+            Self::Points => "points",
+            Self::Detections => "detections",
+            Self::Markers => "markers",
+        }
+    }
+}
+
 /// A topic of ROS 2.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum RosTopic {
@@ -44,24 +57,18 @@ impl RosTopic {
     /// Its name below `namespace`; topics that a ROS network has once are never in a namespace.
     #[must_use]
     pub fn name(&self, namespace: Option<&RosName>) -> RosName {
-        let Self::Vehicle(cav, topic) = self else {
-            return RosName::known(match self {
-                Self::Vehicle(..) | Self::Tf => "/tf",
-                Self::TfStatic => "/tf_static",
-                Self::Clock => "/clock",
-                Self::Diagnostics => "/diagnostics",
-                Self::InitialPose => "/initialpose",
-                Self::Truth => "/truth",
-            });
-        };
-        let leaf = match topic {
-            VehicleTopic::Pose => "pose",
-            VehicleTopic::Odometry => "odometry",
-            VehicleTopic::Points => "points",
-            VehicleTopic::Detections => "detections",
-            VehicleTopic::Markers => "markers",
-        };
-        RosName::known(&format!("{}/{}/{leaf}", namespace.map_or("", RosName::as_str), vehicle(cav)))
+        RosName::known(match self {
+            Self::Vehicle(cav, topic) => {
+                let namespace = namespace.map_or("", RosName::as_str);
+                return RosName::known(&format!("{namespace}/{}/{}", vehicle(cav), topic.name()));
+            }
+            Self::Tf => "/tf",
+            Self::TfStatic => "/tf_static",
+            Self::Clock => "/clock",
+            Self::Diagnostics => "/diagnostics",
+            Self::InitialPose => "/initialpose",
+            Self::Truth => "/truth",
+        })
     }
 
     /// Type of its messages.
