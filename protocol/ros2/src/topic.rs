@@ -1,5 +1,7 @@
 //! Topics of ROS 2 on which this program publishes.
 
+use std::borrow::Cow;
+
 use protocol::CavId;
 
 use super::names::{RosName, vehicle};
@@ -25,6 +27,21 @@ pub enum VehicleTopic {
     Markers,
 }
 
+impl VehicleTopic {
+    /// Its name below the vehicle's.
+    fn name(self) -> Cow<'static, str> {
+        match self {
+            Self::Pose => "pose".into(),
+            Self::Odometry => "odometry".into(),
+            Self::Points => "points".into(),
+            Self::Image(number) => format!("camera_{number}/image/compressed").into(),
+            Self::CameraInfo(number) => format!("camera_{number}/camera_info").into(),
+            Self::Detections => "detections".into(),
+            Self::Markers => "markers".into(),
+        }
+    }
+}
+
 /// A topic of ROS 2.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum RosTopic {
@@ -48,26 +65,18 @@ impl RosTopic {
     /// Its name below `namespace`; topics that a ROS network has once are never in a namespace.
     #[must_use]
     pub fn name(&self, namespace: Option<&RosName>) -> RosName {
-        let Self::Vehicle(cav, topic) = self else {
-            return RosName::known(match self {
-                Self::Vehicle(..) | Self::Tf => "/tf",
-                Self::TfStatic => "/tf_static",
-                Self::Clock => "/clock",
-                Self::Diagnostics => "/diagnostics",
-                Self::InitialPose => "/initialpose",
-                Self::Truth => "/truth",
-            });
-        };
-        let leaf = match topic {
-            VehicleTopic::Pose => "pose",
-            VehicleTopic::Odometry => "odometry",
-            VehicleTopic::Points => "points",
-            VehicleTopic::Image(number) => &format!("camera_{number}/image/compressed"),
-            VehicleTopic::CameraInfo(number) => &format!("camera_{number}/camera_info"),
-            VehicleTopic::Detections => "detections",
-            VehicleTopic::Markers => "markers",
-        };
-        RosName::known(&format!("{}/{}/{leaf}", namespace.map_or("", RosName::as_str), vehicle(cav)))
+        RosName::known(match self {
+            Self::Vehicle(cav, topic) => {
+                let namespace = namespace.map_or("", RosName::as_str);
+                return RosName::known(&format!("{namespace}/{}/{}", vehicle(cav), topic.name()));
+            }
+            Self::Tf => "/tf",
+            Self::TfStatic => "/tf_static",
+            Self::Clock => "/clock",
+            Self::Diagnostics => "/diagnostics",
+            Self::InitialPose => "/initialpose",
+            Self::Truth => "/truth",
+        })
     }
 
     /// Type of its messages.
