@@ -58,7 +58,7 @@ async function check() {
   // Images are received only while somebody asks for them: asked once in a while whether there are any.
   else if (view.frame && view.frame.ego && probes++ % 30 === 0) fetch(`camera/${view.frame.ego}/0`).catch(() => {});
   const before = isKnown(silent) ? ` ${seconds(silent)} ago` : "";
-  if (!router) state("ended", "router gone");
+  if (!router && !over) state("ended", before ? `router gone, last message${before}` : "router gone");
   else if (over && silent > 2) state("ended", `ended${before}`);
   else if (!isKnown(silent)) state("waiting", "waiting for the run");
   else if (silent > 3) state("ended", `last message${before}`);
