@@ -186,7 +186,7 @@ mod tests {
         let known = [
             (RosType::CameraInfo, "b3dfd68ff46c9d56c80fd3bd4ed22c7a4ddce8c8348f2f59c299e73118e7e275"),
             (RosType::Clock, "692f7a66e93a3c83e71765d033b60349ba68023a8c689a79e48078bcb5c58564"),
-            (RosType::CompressedImage, "15640771531571185e2efc8a100baf923961a4e15d5569652e6cb6691e8e371a"),
+            (RosType::CompressedImage, "15640771531571185e2efc8a100baf923961a4d15d5569652e6cb6691e8e371a"),
             (RosType::Detection3dArray, "793f5eab9595ac1c0da07873cc859db42eae51f0ee76056db8562515d830e018"),
             (RosType::DiagnosticArray, "5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e"),
             (RosType::MarkerArray, "86cb8800b6fb05b5eff1abd7a56f62a5641d3ae9a1c29e78e67e704f1d067dcf"),

@@ -179,9 +179,13 @@ mod tests {
         let variables = VarStore::new(Device::Cpu);
         EndToEnd::new(&variables.root(), built).unwrap();
         let named = variables.variables();
+        let last = match built.regresses {
+            EndToEndKind::SgLoc => "regressor.outward",
+            EndToEndKind::Pose => "regressor.2",
+        };
         no_grad(|| {
-            let _ = named["regressor.2.weight"].shallow_clone().zero_();
-            named["regressor.2.bias"].shallow_clone().copy_(&Tensor::from_slice(bias));
+            let _ = named[&format!("{last}.weight")].shallow_clone().zero_();
+            named[&format!("{last}.bias")].shallow_clone().copy_(&Tensor::from_slice(bias));
         });
         let about = BTreeMap::from([
             (CONFIG_KEY.to_owned(), serde_json::to_string(stated).unwrap()),
