@@ -2,8 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
-use dataset::{LoadOptions, ReadError};
-use localization::competitors::SweepDatabase;
+use dataset::{LeftOut, LoadOptions, Problem, ReadError, Scenario};
+use localization::competitors::{DescribedSweep, SweepDatabase};
 use localization::pgc::{Localizer, LocalizerError, LocalizerTimes};
 
 /// Error of building a database of sweeps.
@@ -20,34 +20,54 @@ pub enum DatabaseError {
     NoSweeps(Vec<PathBuf>),
 }
 
-/// Describes every sweep of the drives; `progress` gets the number of sweeps done and of all.
+/// Describes every sweep of the drives; `progress` gets the number of sweeps done and of all. Sweeps that cannot be
+/// read or have no pose are left out and counted in `left_out`.
 ///
 /// # Errors
 /// [`DatabaseError`] names the file.
 pub fn read_database(
     folders: &[impl AsRef<Path>],
     localizer: &Localizer,
+    left_out: &mut LeftOut,
     progress: &mut dyn FnMut(usize, usize),
 ) -> Result<SweepDatabase, DatabaseError> {
     let datasets = folders.iter().map(|folder| dataset::open(folder.as_ref())).collect::<Result<Vec<_>, _>>()?;
     let scenarios: Vec<_> = datasets.iter().flat_map(|dataset| &dataset.scenarios).collect();
     let total = scenarios.iter().map(|scenario| scenario.ticks.len() * scenario.agents.len()).sum();
+    datasets.iter().for_each(|dataset| left_out.add_files(&dataset.problems));
     let (mut sweeps, mut done) = (Vec::new(), 0);
     for scenario in scenarios {
-        for (agent, tick) in
-            (0..scenario.agents.len()).flat_map(|agent| (0..scenario.ticks.len()).map(move |tick| (agent, tick)))
-        {
-            done += 1;
-            progress(done, total);
-            if !scenario.is_present(agent, tick) {
-                continue;
+        for agent in 0..scenario.agents.len() {
+            for tick in 0..scenario.ticks.len() {
+                done += 1;
+                progress(done, total);
+                if !scenario.is_present(agent, tick) {
+                    continue;
+                }
+                match described(scenario, agent, tick, localizer) {
+                    Ok(sweep) => sweeps.extend(sweep),
+                    Err(DatabaseError::Read(error)) => left_out.add_unreadable(agent, Problem::from(&error)),
+                    Err(error) => return Err(error),
+                }
             }
-            let frame = scenario.load(agent, tick, &LoadOptions::default())?;
-            let Some(pose) = frame.world_from_lidar else { continue };
-            let features = localizer.sweep_features(&frame.points, &mut LocalizerTimes::default())?;
-            sweeps.extend(features.map(|features| (features, pose.isometry())));
         }
     }
     let folders = || folders.iter().map(|folder| folder.as_ref().to_owned()).collect();
     SweepDatabase::new(&sweeps).ok_or_else(|| DatabaseError::NoSweeps(folders()))
+}
+
+/// Features and pose of a sweep; `None` for a sweep without cells.
+fn described(
+    scenario: &Scenario,
+    agent: usize,
+    tick: usize,
+    localizer: &Localizer,
+) -> Result<Option<DescribedSweep>, DatabaseError> {
+    let frame = scenario.load(agent, tick, &LoadOptions::default())?;
+    let Some(pose) = frame.world_from_lidar else {
+        let path = scenario.points_path(agent, tick, None)?;
+        return Err(ReadError::malformed(&path, "there is no pose for this sweep").into());
+    };
+    let features = localizer.sweep_features(&frame.points, &mut LocalizerTimes::default())?;
+    Ok(features.map(|descriptor| DescribedSweep { descriptor, world_from_sensor: pose.isometry() }))
 }

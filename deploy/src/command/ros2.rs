@@ -51,7 +51,7 @@ struct Network {
     distro: Distro,
 }
 
-/// What is published.
+/// Published messages.
 #[derive(Debug, clap::Args)]
 #[command(next_help_heading = "Messages")]
 struct Content {

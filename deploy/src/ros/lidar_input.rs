@@ -17,7 +17,7 @@ use super::session::{RosSession, RosSubscription};
 
 /// Interval between log lines about messages that are left out.
 const LOG_PERIOD: Duration = Duration::from_secs(10);
-/// What a receiver of the run accepts.
+/// Limits of a receiver of the run.
 const LIMITS: SweepLimits =
     SweepLimits { max_points: Limits::DEFAULT.max_points, max_abs_value: Limits::DEFAULT.max_abs_value };
 

@@ -57,7 +57,7 @@ impl Default for NodeOptions {
     }
 }
 
-/// What the node has done.
+/// Summary of a node: messages published and received.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
 pub struct NodeReport {
     /// Messages published, by topic; without sweeps.

@@ -12,8 +12,6 @@ use zenoh::qos::CongestionControl;
 use zenoh::{Session, Wait};
 use zenoh_ext::{AdvancedPublisher, AdvancedPublisherBuilderExt, CacheConfig, MissDetectionConfig};
 
-use super::session::has_subscribers;
-
 /// Period at which the last sequence number of a latched topic is repeated if it has changed, as rmw_zenoh does.
 const HEARTBEAT: Duration = Duration::from_millis(500);
 
@@ -51,7 +49,7 @@ impl RosPublisher {
             Kind::Latched(builder.wait().map_err(refused)?)
         } else {
             let publisher = builder.wait().map_err(refused)?;
-            let has_subscribers = has_subscribers(&publisher).map_err(refused)?;
+            let has_subscribers = bus::has_subscribers(&publisher).map_err(refused)?;
             Kind::Plain { publisher, has_subscribers }
         };
         Ok(Self { kind, gid, published: 0, _token: token })

@@ -1,7 +1,6 @@
 //! Session on a ROS 2 network: a node, its publishers and its subscriptions.
 
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
+use std::sync::atomic::{AtomicU32, Ordering};
 
 use bus::BusError;
 use ros2::endpoint::{Endpoint, EndpointKind, Node, gid};
@@ -86,16 +85,4 @@ impl RosSession {
 fn declare_token(session: &Session, key: &str) -> Result<LivelinessToken, BusError> {
     let token = session.liveliness().declare_token(key).wait();
     token.map_err(|cause| BusError::zenoh(format!("declaring {key}"), &cause))
-}
-
-/// True while a publisher has subscribers, updated for its lifetime.
-pub(super) fn has_subscribers(publisher: &zenoh::pubsub::Publisher<'_>) -> zenoh::Result<Arc<AtomicBool>> {
-    let has_subscribers = Arc::<AtomicBool>::default();
-    let noted = Arc::clone(&has_subscribers);
-    let listener = publisher.matching_listener();
-    listener.callback(move |status| noted.store(status.matching(), Ordering::Relaxed)).background().wait()?;
-    if publisher.matching_status().wait()?.matching() {
-        has_subscribers.store(true, Ordering::Relaxed);
-    }
-    Ok(has_subscribers)
 }

@@ -40,15 +40,10 @@ pub(super) struct Judgement {
 impl Judgement {
     /// True and false positives from a score on, and missed objects.
     pub(super) fn counts(&self, result: &Detections, least_score: f32) -> [usize; 3] {
-        let is_counted = |score: &f32| *score >= least_score;
-        let scores = result.detections.iter().map(|detection| detection.score);
-        let [mut hits, mut false_positives] = [0, 0];
-        for (score, is_hit) in scores.zip(&self.hits).filter(|(score, _)| is_counted(score)) {
-            let _ = score;
-            *(if *is_hit { &mut hits } else { &mut false_positives }) += 1;
-        }
-        let missed = self.found.values().filter(|score| !score.is_some_and(|score| is_counted(&score))).count();
-        [hits, false_positives, missed]
+        let shown = result.detections.iter().zip(&self.hits).filter(|(detection, _)| detection.score >= least_score);
+        let (hits, false_positives): (Vec<_>, Vec<_>) = shown.partition(|(_, is_hit)| **is_hit);
+        let missed = self.found.values().filter(|score| score.is_none_or(|score| score < least_score));
+        [hits.len(), false_positives.len(), missed.count()]
     }
 }
 

@@ -44,7 +44,7 @@ pub struct LiveRun {
     thread: Option<JoinHandle<()>>,
 }
 
-/// What is known of a live run besides its frames.
+/// Status of a live run: time since its last message, end, connection, cameras.
 #[derive(Debug, Clone, Serialize)]
 pub(super) struct RunStatus {
     /// Time since the last message, seconds; `None`: there was none since a page is open.

@@ -117,7 +117,7 @@ pub struct ShownBox {
     pub is_counted: bool,
     /// Score of the detection that found a true object.
     pub found_score: Option<f32>,
-    /// Whether a detection is a true positive; `None` if that is not known.
+    /// True if a detection is a true positive; `None` if that is not known.
     pub is_hit: Option<bool>,
 }
 

@@ -78,7 +78,7 @@ pub use message_stats::{MessageStats, PeerSummary, SharedMemoryUse};
 pub use passive_subscriber::{PassiveSubscriber, RawMessage};
 pub use process_config::{Configured, ProcessConfig, minimal};
 pub use process_usage::{process_cpu_s, process_usage};
-pub use publisher::{Overflow, Publisher, PublisherOptions, unix_nanos};
+pub use publisher::{Overflow, Publisher, PublisherOptions, has_subscribers, unix_nanos};
 pub use readiness::{Barrier, NotReady, Route, RouteError, RoutesReady, process_id};
 pub use rejection_log::{Rejection, RejectionLog};
 pub use session::{BusOptions, Role as SessionRole, SharedMemory, open};

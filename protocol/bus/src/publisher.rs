@@ -338,8 +338,11 @@ impl Sender {
     }
 }
 
-/// True while there are subscribers, updated for the lifetime of the publisher.
-fn has_subscribers(publisher: &zenoh::pubsub::Publisher<'_>) -> zenoh::Result<Arc<AtomicBool>> {
+/// True while a publisher has subscribers, updated for its lifetime.
+///
+/// # Errors
+/// Those of zenoh.
+pub fn has_subscribers(publisher: &zenoh::pubsub::Publisher<'_>) -> zenoh::Result<Arc<AtomicBool>> {
     let has_subscribers = Arc::<AtomicBool>::default();
     let noted = Arc::clone(&has_subscribers);
     let listener = publisher.matching_listener();

@@ -29,8 +29,8 @@ pub(super) struct ScenarioFolder {
     /// Suffixes of point files other than the plain one and the radar's.
     pub(super) variants: Vec<String>,
     pub(super) has_radar: bool,
-    /// Numbers of the cameras of any agent.
-    pub(super) cameras: Vec<u8>,
+    /// Numbers of the cameras of each agent.
+    pub(super) cameras: BTreeMap<CavId, BTreeSet<u8>>,
     /// Suffix of the sweeps.
     pub(super) suffix: &'static str,
     /// Agents that have sweeps and nothing else.
@@ -135,8 +135,7 @@ impl ScenarioFolder {
         }
         let variants: BTreeSet<String> = by_agent.values().flat_map(|agent| agent.variants.iter().cloned()).collect();
         let has_radar = by_agent.values().any(|agent| agent.has_radar);
-        let cameras: BTreeSet<u8> = by_agent.values().flat_map(|agent| agent.cameras.iter().copied()).collect();
-        let cameras = cameras.into_iter().collect();
+        let cameras = by_agent.iter().map(|(id, agent)| (id.clone(), agent.cameras.clone())).collect();
         let variants = variants.into_iter().collect();
         let bare = by_agent.iter().filter(|(_, agent)| agent.is_without_yaml);
         let without_yaml = bare.map(|(id, _)| id.clone()).collect();

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use imagesize::ImageSize;
 use nalgebra::{Isometry3, Matrix3, Rotation3, UnitQuaternion};
-use protocol::{Camera, CameraMetadata, ImageFormat, Pinhole, Pose};
+use protocol::{Camera, CameraMetadata, ImageFormat, Limits, Payload, Pinhole, Pose};
 
 use super::ReadError;
 use super::files;
@@ -32,12 +32,16 @@ fn number(name: &str) -> Option<u8> {
     (is_image && digits.bytes().all(|byte| byte.is_ascii_digit())).then(|| digits.parse().ok()).flatten()
 }
 
-/// The image of a camera beside `dir/stem.yaml`; `None` if there is none.
-pub(super) fn find(dir: &Path, stem: &str, number: u8) -> Option<PathBuf> {
+/// The image of a camera beside `dir/stem.yaml`.
+pub(super) fn find(dir: &Path, stem: &str, number: u8) -> Result<PathBuf, ReadError> {
     let names = PREFIXES
         .iter()
         .flat_map(|prefix| ENDINGS.iter().map(move |ending| dir.join(format!("{stem}_{prefix}{number}.{ending}"))));
-    names.into_iter().find(|path| path.is_file())
+    let missing = || {
+        let path = dir.join(format!("{stem}_{}{number}.{}", PREFIXES[0], ENDINGS[0]));
+        ReadError::malformed(&path, "there is no image of this camera, which has some of other frames")
+    };
+    names.into_iter().find(|path| path.is_file()).ok_or_else(missing)
 }
 
 /// Reads an image; its calibration is that of the entry for the camera in `root`, if there is one.
@@ -69,6 +73,7 @@ pub(super) fn read(
             metadata.lidar_from_camera = Some(lidar_from_camera(&pose(&lidar)?, &pose(&cords)?));
         }
     }
+    Camera::check(&metadata, &Limits::DEFAULT).map_err(|error| ReadError::malformed(path, error.to_string()))?;
     Ok(Camera { metadata, image })
 }
 

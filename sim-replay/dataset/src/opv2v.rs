@@ -54,10 +54,12 @@ impl FrameSource for Opv2v {
         };
         let (root, dir) = (Field::root(&path, &node), self.folder.agent_dir(agent));
         let mut found = CameraImages::default();
-        for &number in numbers {
-            // An agent may have fewer cameras than others.
-            let Some(file) = camera_files::find(&dir, &tick.stem, number) else { continue };
-            found.add(number, camera_files::read(&file, number, &root, &|field| self.six_numbers(field)));
+        // An agent may have fewer cameras than others.
+        let own = self.folder.cameras.get(agent);
+        for &number in numbers.iter().filter(|number| own.is_some_and(|own| own.contains(number))) {
+            let file = camera_files::find(&dir, &tick.stem, number);
+            let read = |file: PathBuf| camera_files::read(&file, number, &root, &|field| self.six_numbers(field));
+            found.add(number, file.and_then(read));
         }
         found
     }

@@ -1,5 +1,6 @@
 //! Reader of OPV2V and the layouts of its family: a folder per scenario, in it a folder per agent.
 
+use std::collections::BTreeSet;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -99,7 +100,7 @@ fn agent_folder_scenario(
         roadside_units: folder.agents.iter().filter(is_unit).cloned().collect(),
         lidar_variants: folder.variants.clone(),
         has_radar: folder.has_radar,
-        cameras: if layout == Layout::V2V4REAL { Vec::new() } else { folder.cameras.clone() },
+        cameras: if layout == Layout::V2V4REAL { Vec::new() } else { all_cameras(&folder) },
         layout,
         source_handedness,
         source: if layout == Layout::V2V4REAL {
@@ -108,6 +109,12 @@ fn agent_folder_scenario(
             Arc::new(Opv2v { folder, sweeps, handedness: source_handedness })
         },
     }
+}
+
+/// Numbers of the cameras of any agent.
+fn all_cameras(folder: &ScenarioFolder) -> Vec<u8> {
+    let all: BTreeSet<u8> = folder.cameras.values().flatten().copied().collect();
+    all.into_iter().collect()
 }
 
 /// The layout by the shape of the first pose that can be read, and then by the kind of sweeps. Frames with another

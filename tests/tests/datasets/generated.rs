@@ -325,5 +325,10 @@ fn cameras_are_read_with_the_calibration_that_they_were_rendered_with() {
     let frame = scenario.load(1, 1, &load).unwrap();
     assert_eq!(frame.cameras.iter().map(|(number, _)| *number).collect::<Vec<_>>(), [0, 1, 3]);
     assert!(frame.problems[0].message.contains("_camera2.png"), "{:?}", frame.problems);
+    // One that is missing too.
+    std::fs::remove_file(broken.join(format!("{}_camera2.png", scenario.ticks[1].stem))).unwrap();
+    let frame = scenario.load(1, 1, &load).unwrap();
+    assert_eq!(frame.cameras.len(), 3);
+    assert!(frame.problems[0].message.contains("there is no image of this camera"), "{:?}", frame.problems);
     assert!(scenario.load(1, 1, &LoadOptions::default()).unwrap().cameras.is_empty());
 }

@@ -3,7 +3,7 @@
 //! [`EndToEndKind::SgLoc`] keeps of SGLoc the position of a cell as a feature, the attention between scales, the residual head
 //! with batch normalisation, the shift as output, the L1 loss and RANSAC. It has PGC's encoder, frozen, in place of one
 //! of its own of 55 million parameters, a head of 2.7 million in place of 57, and no inter-geometric-consistency term,
-//! which the public training does not call either.
+//! which the published training code does not use either.
 //!
 //! [`EndToEndKind::Pose`] stands for absolute pose regression, from the features of a whole sweep. It has none of the
 //! additions of HypLiLoc (a second branch on the spherical projection, hyperbolic fusion) and DiffLoc (features of a

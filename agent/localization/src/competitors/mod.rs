@@ -9,4 +9,4 @@ mod sgloc_head;
 pub use end_to_end::{EndToEnd, EndToEndConfig, EndToEndKind};
 pub use end_to_end_localizer::EndToEndLocalizer;
 pub use lightloc::LightLoc;
-pub use retrieval::{Retrieval, SweepDatabase};
+pub use retrieval::{DescribedSweep, Retrieval, SweepDatabase};

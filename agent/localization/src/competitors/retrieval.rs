@@ -12,6 +12,15 @@ use crate::pgc::{Localization, Localize, Localizer, LocalizerError, LocalizerTim
 /// Smallest deviation of a channel: constant ones are scaled as if they had this one.
 const LEAST_DEVIATION: f32 = 1e-4;
 
+/// A sweep of the database.
+#[derive(Debug, Clone)]
+pub struct DescribedSweep {
+    /// Features of the whole sweep, `[sweep_channels]`.
+    pub descriptor: Vec<f32>,
+    /// True pose of its sensor, metres.
+    pub world_from_sensor: Isometry3<f64>,
+}
+
 /// Descriptors of sweeps with their poses.
 #[derive(Debug, Clone)]
 pub struct SweepDatabase {
@@ -25,15 +34,16 @@ pub struct SweepDatabase {
 impl SweepDatabase {
     /// A database of descriptors of equal length; `None` if there is none or they are empty.
     #[must_use]
-    pub fn new(sweeps: &[(Vec<f32>, Isometry3<f64>)]) -> Option<Self> {
-        let channels = sweeps.first().map(|(descriptor, _)| descriptor.len()).filter(|&channels| channels > 0)?;
+    pub fn new(sweeps: &[DescribedSweep]) -> Option<Self> {
+        let channels = sweeps.first().map(|sweep| sweep.descriptor.len()).filter(|&channels| channels > 0)?;
         let count = sweeps.len() as f32;
-        let mean_of = |value: &dyn Fn(&[f32]) -> f32| sweeps.iter().map(|(of, _)| value(of)).sum::<f32>() / count;
+        let mean_of =
+            |value: &dyn Fn(&[f32]) -> f32| sweeps.iter().map(|sweep| value(&sweep.descriptor)).sum::<f32>() / count;
         let mean: Vec<f32> = (0..channels).map(|channel| mean_of(&|of| of[channel])).collect();
         let variance = |channel: usize| mean_of(&|of| (of[channel] - mean[channel]).powi(2));
         let scale = (0..channels).map(|channel| 1.0 / variance(channel).sqrt().max(LEAST_DEVIATION)).collect();
         let mut database = Self { mean, scale, descriptors: Vec::new(), world_from_sensor: Vec::new() };
-        for (descriptor, world_from_sensor) in sweeps {
+        for DescribedSweep { descriptor, world_from_sensor } in sweeps {
             let normalised = database.normalise(descriptor);
             database.descriptors.extend(normalised);
             database.world_from_sensor.push(*world_from_sensor);
@@ -94,11 +104,12 @@ mod tests {
     #[test]
     fn the_nearest_descriptor_is_found_whatever_the_scale_of_a_channel() {
         let place = |x: f64| Isometry3::translation(x, 0.0, 0.0);
-        let sweeps =
-            vec![(vec![0.0, 1000.0], place(1.0)), (vec![1.0, 1001.0], place(2.0)), (vec![0.5, 3000.0], place(3.0))];
+        let sweep =
+            |descriptor: &[f32], x: f64| DescribedSweep { descriptor: descriptor.into(), world_from_sensor: place(x) };
+        let sweeps = [sweep(&[0.0, 1000.0], 1.0), sweep(&[1.0, 1001.0], 2.0), sweep(&[0.5, 3000.0], 3.0)];
         let database = SweepDatabase::new(&sweeps).unwrap();
         assert_eq!(database.nearest(&[0.9, 1300.0]), place(2.0));
         assert_eq!(database.nearest(&[0.9, 2900.0]), place(3.0));
-        assert!(SweepDatabase::new(&[]).is_none() && SweepDatabase::new(&[(vec![], place(0.0))]).is_none());
+        assert!(SweepDatabase::new(&[]).is_none() && SweepDatabase::new(&[sweep(&[], 0.0)]).is_none());
     }
 }

@@ -158,7 +158,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     }
     let (mut sweeps, mut tracked, mut left_out) = (Vec::new(), Vec::new(), LeftOut::default());
     for (head, scenes) in &groups {
-        let evaluated = args.evaluate(args.subject(head)?, scenes)?;
+        let evaluated = args.evaluate(args.subject(head, &mut left_out)?, scenes)?;
         sweeps.extend(evaluated.sweeps);
         left_out.merge(&evaluated.left_out);
         if args.tracked {
@@ -189,9 +189,9 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
 }
 
 impl Args {
-    fn subject(&self, head: &Path) -> Result<Subject, BadInput> {
+    fn subject(&self, head: &Path, left_out: &mut LeftOut) -> Result<Subject, BadInput> {
         if self.icp_map.is_empty() {
-            return Ok(Subject::Localizer(self.localizer(head, self.inference()?)?));
+            return Ok(Subject::Localizer(self.localizer(head, self.inference()?, left_out)?));
         }
         if !self.map_spacing.is_finite() || self.map_spacing < 0.0 {
             return Err(BadInput::new(format!("--map-spacing is {}, must be 0 or more", self.map_spacing)));
@@ -217,7 +217,12 @@ impl Args {
         Ok(Subject::Source(Box::new(TrackedPose::load(&config, self.inference()?).map_err(BadInput::of)?)))
     }
 
-    fn localizer(&self, head: &Path, inference: Inference) -> Result<Box<dyn Localize>, BadInput> {
+    fn localizer(
+        &self,
+        head: &Path,
+        inference: Inference,
+        left_out: &mut LeftOut,
+    ) -> Result<Box<dyn Localize>, BadInput> {
         let solver = match self.solver {
             Search::Ransac => Solver::Ransac(RansacConfig { seed: self.seed, ..RansacConfig::default() }),
             Search::Sc2pcr => Solver::Sc2Pcr(Sc2PcrConfig::default()),
@@ -234,20 +239,20 @@ impl Args {
             return Ok(Box::new(LightLoc::new(localizer, plain)));
         }
         if !self.retrieval.is_empty() {
-            return self.retrieval(localizer);
+            return self.retrieval(localizer, left_out);
         }
         let confidence = localizer.solver().confidence.clone();
         localizer.set_solver(PoseSolver { solver, confidence });
         Ok(Box::new(localizer))
     }
 
-    fn retrieval(&self, localizer: Localizer) -> Result<Box<dyn Localize>, BadInput> {
+    fn retrieval(&self, localizer: Localizer, left_out: &mut LeftOut) -> Result<Box<dyn Localize>, BadInput> {
         let bar = progress::bar(0, "sweeps described");
         let mut on_sweep = |done, all| {
             bar.set_length(all as u64);
             bar.set_position(done as u64);
         };
-        let database = read_database(&self.retrieval, &localizer, &mut on_sweep);
+        let database = read_database(&self.retrieval, &localizer, left_out, &mut on_sweep);
         bar.finish_and_clear();
         Ok(Box::new(Retrieval::new(localizer, database.map_err(BadInput::of)?)))
     }

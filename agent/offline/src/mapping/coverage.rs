@@ -11,7 +11,7 @@ const CELL_M: f64 = 25.0;
 /// Most cells along an edge of the picture.
 const MOST_CELLS: f64 = 60.0;
 
-/// Where a place has been driven, in the frame of the map.
+/// Area of a place that has been driven, in the frame of the map.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Coverage {
     /// Number of sweeps.

@@ -24,7 +24,7 @@ pub struct MapReport {
     pub confidence: Option<FitReport>,
     /// Number of activations with scales for 8-bit inference.
     pub activation_scales: usize,
-    /// Where the training sweeps were recorded.
+    /// Area in which the training sweeps were recorded.
     pub coverage: Coverage,
     /// Sweeps and files that were left out.
     pub left_out: Option<String>,
@@ -78,7 +78,7 @@ impl HeldOutAccuracy {
 }
 
 impl MapReport {
-    /// Where the place was driven, in one line.
+    /// The driven area, in one line.
     #[must_use]
     pub fn coverage_text(&self) -> String {
         let Coverage { sweeps, length_m, low_m, high_m, cells, cell_m, .. } = &self.coverage;

@@ -64,7 +64,8 @@ pub fn convert(
     let done = AtomicUsize::new(0);
     for scenario in &dataset.scenarios {
         writer.begin(&header(scenario, dataset)?)?;
-        let frames = write_moments(scenario, writer.as_ref(), (&omitted, &left_out), &|| {
+        let holds_images = options.layout == SceneLayout::Opv2v;
+        let frames = write_moments(scenario, writer.as_ref(), holds_images, (&omitted, &left_out), &|| {
             progress(done.fetch_add(1, Ordering::Relaxed) + 1, total);
         })?;
         writer.end()?;
@@ -102,6 +103,7 @@ fn header(scenario: &Scenario, dataset: &Dataset) -> Result<SceneHeader, SynthEr
 fn write_moments(
     scenario: &Scenario,
     writer: &dyn SceneWriter,
+    holds_images: bool,
     (omitted, left_out): (&Omissions, &Mutex<LeftOut>),
     done: &(dyn Fn() + Sync),
 ) -> Result<usize, SynthError> {
@@ -117,6 +119,10 @@ fn write_moments(
             AgentFrame { agent, frame, variants, simulated: None }
         });
         let moment = Moment { index, frames: frames.collect() };
+        if !holds_images {
+            let images = moment.frames.iter().map(|agent| agent.frame.cameras.len()).sum();
+            omitted.add("camera images, which the layout does not have", images);
+        }
         writer.write(&moment, omitted)?;
         Ok(moment.frames.len())
     });

@@ -8,7 +8,8 @@ mod shading;
 use std::fmt;
 use std::str::FromStr;
 
-use nalgebra::{Isometry3, Matrix3, Rotation3, Translation3, UnitQuaternion, Vector3};
+use dataset::camera_files::body_from_optical;
+use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 use protocol::{Camera, CameraMetadata, ImageFormat, Pinhole};
 
 pub(super) use paint::{Paint, of_shape, of_vehicle};
@@ -184,10 +185,9 @@ impl MountedCamera {
 
 /// Pose of the optical frame, z ahead, x right, y down, in the LiDAR's.
 fn lidar_from_camera(position_m: Vector3<f64>, yaw_rad: f64) -> Isometry3<f64> {
-    let optical = Matrix3::new(0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, -1.0, 0.0);
-    let axes = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(optical));
     let turned = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw_rad);
-    Isometry3::from_parts(Translation3::from(position_m - Vector3::from(LIDAR_MOUNT_M)), turned * axes)
+    let lidar_from_body = Translation3::from(position_m - Vector3::from(LIDAR_MOUNT_M)) * turned;
+    lidar_from_body * body_from_optical()
 }
 
 #[cfg(test)]
