@@ -222,7 +222,7 @@ fn maps(
     scenarios: &[Scenario],
 ) -> Result<MapSource, EvaluationError> {
     let weights = Arc::new(Weights::load(weights).map_err(EvaluateError::from)?.with_precision(precision));
-    let store = FeatureStore::open(kept, &weights, scenarios, &mut |_, _| {});
+    let store = FeatureStore::open(kept, &weights, scenarios, 1, &mut |_, _| {});
     Ok(MapSource::new(Arc::new(store.map_err(|error| EvaluateError::from(Box::new(error)))?), weights))
 }
 

@@ -13,19 +13,16 @@ use std::sync::Arc;
 
 use dataset::{self, IntensityScale, LoadOptions, ReadError, Scenario};
 use perception::detector::{Detector, DetectorError};
+use perception::train::{Prefetch, TrainingError};
 use perception::weights::{Weights, WeightsError};
-use protocol::codec::encode_features;
 use protocol::message::Bev;
-use protocol::{
-    BevFeatures, CavId, CodecConfig, Dtype, Header, Limits, NoPoseReason, PoseEstimate, Stamp, WIRE_VERSION, WireError,
-    wire,
-};
+use protocol::{Dtype, Header, Limits, WIRE_VERSION, WireError, wire};
 use tch::{Device, TchError, Tensor};
+
+use crate::sweep_encoder::SweepEncoder;
 
 /// Digits of each hash in the name of a file.
 const HASH_DIGITS: usize = 12;
-/// zstd level of a message: more costs time and saves nothing.
-const ZSTD_LEVEL: i32 = 1;
 
 /// Error of storing or reading maps.
 #[derive(Debug, thiserror::Error)]
@@ -55,6 +52,9 @@ pub enum FeatureStoreError {
     /// The encoder reported an error.
     #[error(transparent)]
     Detector(#[from] DetectorError),
+    /// A thread that encodes has ended.
+    #[error(transparent)]
+    Thread(#[from] TrainingError),
     /// The tensor library reported an error.
     #[error("kept maps: {0}")]
     Torch(#[from] TchError),
@@ -84,7 +84,6 @@ pub fn is_encoder(name: &str) -> bool {
 pub struct FeatureStore {
     path: PathBuf,
     file: File,
-    dtype: Dtype,
     /// Names of the scenarios.
     names: Vec<String>,
     /// Index of each scenario's first sweep, and of the end.
@@ -96,7 +95,7 @@ pub struct FeatureStore {
 }
 
 impl FeatureStore {
-    /// Opens the file of these scenarios and encodes the missing sweeps, up to its size.
+    /// Opens the file of these scenarios and encodes the missing sweeps on `threads` CPU threads, up to its size.
     ///
     /// `on_sweep` gets the number of stored sweeps and of all. An interrupted run is continued.
     ///
@@ -104,8 +103,9 @@ impl FeatureStore {
     /// [`FeatureStoreError`] names the file.
     pub fn open(
         kept: &KeptMaps,
-        weights: &Weights,
+        weights: &Arc<Weights>,
         scenarios: &[Scenario],
+        threads: usize,
         on_sweep: &mut dyn FnMut(usize, usize),
     ) -> Result<Self, FeatureStoreError> {
         let [encoder, data] = [weights.sha256_of(is_encoder), dataset::content_sha256(scenarios)];
@@ -133,62 +133,43 @@ impl FeatureStore {
         }
         let names = scenarios.iter().map(|scenario| scenario.name.clone()).collect();
         let ticks = scenarios.iter().map(|scenario| scenario.ticks.len()).collect();
-        let mut store = Self { path: path.clone(), file, dtype: kept.dtype, names, first, ticks, starts };
-        store.fill(weights, scenarios, kept.limit_bytes, on_sweep)?;
+        let encoder = SweepEncoder {
+            weights: Arc::clone(weights),
+            scenarios: scenarios.into(),
+            first: first.as_slice().into(),
+            dtype: kept.dtype,
+            path: path.clone(),
+            detector: None,
+        };
+        let mut store = Self { path: path.clone(), file, names, first, ticks, starts };
+        store.fill(encoder, kept.limit_bytes, threads, on_sweep)?;
         store.file.unlock().map_err(|source| store.io(source))?;
         Ok(store)
     }
 
     fn fill(
         &mut self,
-        weights: &Weights,
-        scenarios: &[Scenario],
+        encoder: SweepEncoder,
         limit_bytes: u64,
+        threads: usize,
         on_sweep: &mut dyn FnMut(usize, usize),
     ) -> Result<(), FeatureStoreError> {
         let (stored, all) = self.sweeps();
         if stored == all || self.bytes() >= limit_bytes {
             return Ok(());
         }
-        let mut detector = Detector::from_weights(weights, &weights.config()?, Device::Cpu)?;
-        for (index, scenario) in scenarios.iter().enumerate() {
-            for sweep in 0..self.first[index + 1] - self.first[index] {
-                if self.first[index] + sweep < stored {
-                    continue;
-                }
-                if self.bytes() >= limit_bytes {
-                    return Ok(());
-                }
-                let (agent, tick) = (sweep / self.ticks[index], sweep % self.ticks[index]);
-                // A sweep that is absent or cannot be read has an empty entry.
-                let message = match scenario.load(agent, tick, &LoadOptions::default()) {
-                    Ok(frame) => {
-                        let map = detector.encode(&frame.points)?.features;
-                        self.packed(detector.to_kept(&map)?)?
-                    }
-                    Err(_) => Vec::new(),
-                };
-                let length = u32::try_from(message.len()).map_err(|_| self.io(io::ErrorKind::FileTooLarge.into()))?;
-                let record = [&length.to_le_bytes()[..], &message].concat();
-                self.file.write_all(&record).map_err(|source| self.io(source))?;
-                self.starts.push(self.bytes() + record.len() as u64);
-                on_sweep(self.sweeps().0, all);
-            }
+        let mut encoder = encoder;
+        let mut messages =
+            Prefetch::start(threads.min(all - stored), stored as u64, move |sweep| encoder.message(sweep as usize));
+        while self.sweeps().0 < all && self.bytes() < limit_bytes {
+            let message = messages.next_batch()??;
+            let length = u32::try_from(message.len()).map_err(|_| self.io(io::ErrorKind::FileTooLarge.into()))?;
+            let record = [&length.to_le_bytes()[..], &message].concat();
+            self.file.write_all(&record).map_err(|source| self.io(source))?;
+            self.starts.push(self.bytes() + record.len() as u64);
+            on_sweep(self.sweeps().0, all);
         }
         Ok(())
-    }
-
-    fn packed(&self, features: BevFeatures) -> Result<Vec<u8>, FeatureStoreError> {
-        let codec = CodecConfig { dtype: self.dtype, zstd_level: Some(ZSTD_LEVEL), ..CodecConfig::default() };
-        // Sender and time of a map follow from its index.
-        let cav = CavId::new("0").map_err(|_| self.io(io::ErrorKind::InvalidInput.into()))?;
-        let stamp = Stamp { cav, epoch: 0, sequence: 0, capture_nanos: 0, publish_nanos: 0 };
-        let pose = PoseEstimate::NoPose { reason: NoPoseReason::NoSource, inlier_count: 0 };
-        let encode = || -> Result<_, WireError> {
-            let features = encode_features(features, &codec, None)?;
-            Ok(wire::encode(&stamp, Bev { pose, features })?.to_vec())
-        };
-        encode().map_err(|source| FeatureStoreError::Wire { path: self.path.clone(), source })
     }
 
     /// The map of a sweep, `[1, C, H, W]`, by scenario, agent and tick; `None` where it did not fit or the sweep could

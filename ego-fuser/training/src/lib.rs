@@ -21,4 +21,5 @@ pub mod average_precision;
 pub mod feature_store;
 pub mod loss;
 pub mod samples;
+mod sweep_encoder;
 pub mod train;

@@ -4,6 +4,7 @@
 use std::fs;
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use ::training::feature_store::{FeatureStore, KeptMaps, MapSource, is_encoder};
 use ::training::samples::{Moments, SamplePoses};
@@ -66,11 +67,11 @@ fn evaluate(weights: &Path, data: &Path, poses: PoseSourceConfig, delay_nanos: u
     let mut evaluator = Evaluator::new(config).unwrap();
     let scenarios = dataset::open(data).unwrap().scenarios;
     if maps {
-        let weights = Weights::load(weights).unwrap();
+        let weights = Arc::new(Weights::load(weights).unwrap());
         let folder = data.join("../evaluation-maps");
         let kept = KeptMaps { folder, dtype: Dtype::F16, limit_bytes: u64::MAX, intensity_scale: IntensityScale::AUTO };
-        let store = FeatureStore::open(&kept, &weights, &scenarios, &mut |_, _| {}).unwrap();
-        evaluator = evaluator.with_maps(MapSource::new(store.into(), weights.into()));
+        let store = FeatureStore::open(&kept, &weights, &scenarios, 2, &mut |_, _| {}).unwrap();
+        evaluator = evaluator.with_maps(MapSource::new(store.into(), weights));
     }
     let mut frames = Vec::new();
     for scenario in &scenarios {
@@ -135,7 +136,7 @@ fn kept_maps_are_bounded_and_survive_a_cut() {
     let _generator = random_generator_lock();
     let folder = tempfile::tempdir().unwrap();
     let (data, init) = begin(folder.path());
-    let weights = Weights::load(&init).unwrap();
+    let weights = Arc::new(Weights::load(&init).unwrap());
     let scenarios = dataset::open(&data).unwrap().scenarios;
     let open = |limit_bytes: u64| {
         let kept = KeptMaps {
@@ -145,7 +146,7 @@ fn kept_maps_are_bounded_and_survive_a_cut() {
             intensity_scale: IntensityScale::AUTO,
         };
         let mut encoded = 0;
-        let store = FeatureStore::open(&kept, &weights, &scenarios, &mut |_, _| encoded += 1).unwrap();
+        let store = FeatureStore::open(&kept, &weights, &scenarios, 2, &mut |_, _| encoded += 1).unwrap();
         (store, encoded)
     };
     let (few, encoded) = open(1);

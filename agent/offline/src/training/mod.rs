@@ -22,7 +22,7 @@ pub use feature_cache::SweepAugmentation;
 pub(crate) use kmeans::kmeans;
 pub use pairs::Pair;
 pub(crate) use redundancy::Redundancy;
-pub use redundancy::RedundancyConfig;
+pub use redundancy::{LeaveOut, RedundancyConfig};
 pub use scene_training::{SceneReport, SceneSummary, SceneTrainConfig, train_scene};
 pub(crate) use scene_training::{SceneSweeps, train_scene_on};
 pub use scene_validation::SceneAccuracy;

@@ -1,8 +1,25 @@
 //! Redundant Sample Downsampling (LightLoc, Li et al. 2025): leaves out sweeps whose losses vary least.
 
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+/// Choice of the sweeps that are left out.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, clap::ValueEnum)]
+pub enum LeaveOut {
+    /// Those whose losses vary least (RSD).
+    #[default]
+    EvenLoss,
+    /// Random ones, as many: the control of RSD.
+    Random,
+}
+
 /// Windows of observation and share of sweeps that are left out.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RedundancyConfig {
+    /// Choice of the sweeps.
+    pub leave_out: LeaveOut,
+    /// Seed of a random choice.
+    pub seed: u64,
     /// Share of each cluster's sweeps that is dropped at the end of a window.
     pub drop: f64,
     /// The two windows in which losses are recorded, start and end as shares of the training.
@@ -14,7 +31,7 @@ pub struct RedundancyConfig {
 impl Default for RedundancyConfig {
     /// A quarter after each of two windows; the last sixth of the training uses all.
     fn default() -> Self {
-        Self { drop: 0.25, windows: [[0.1, 0.25], [0.35, 0.5]], all_from: 0.84 }
+        Self { leave_out: LeaveOut::EvenLoss, seed: 0, drop: 0.25, windows: [[0.1, 0.25], [0.35, 0.5]], all_from: 0.84 }
     }
 }
 
@@ -33,6 +50,7 @@ pub(crate) struct Redundancy {
     /// Median losses of each sweep in the current window, one per pass.
     recorded: Vec<Vec<f32>>,
     windows_done: usize,
+    rng: ChaCha8Rng,
 }
 
 impl Redundancy {
@@ -40,7 +58,14 @@ impl Redundancy {
     #[must_use]
     pub(crate) fn new(config: RedundancyConfig, class_of_sweep: Vec<usize>) -> Self {
         let count = class_of_sweep.len();
-        Self { config, class_of_sweep, weights: vec![1.0; count], recorded: vec![Vec::new(); count], windows_done: 0 }
+        Self {
+            rng: ChaCha8Rng::seed_from_u64(config.seed),
+            config,
+            class_of_sweep,
+            weights: vec![1.0; count],
+            recorded: vec![Vec::new(); count],
+            windows_done: 0,
+        }
     }
 
     /// Weight of each sweep; 0: not used.
@@ -88,7 +113,7 @@ impl Redundancy {
                     "a window of RSD held fewer than {ENOUGH_PASSES} passes over the data: no sweep is left out after it"
                 );
             }
-            self.drop_most_even();
+            self.drop_redundant();
             self.windows_done += 1;
             self.recorded.iter_mut().for_each(Vec::clear);
             return true;
@@ -96,14 +121,23 @@ impl Redundancy {
         false
     }
 
-    /// Leaves out the sweeps with the lowest variance of their losses in each cluster; the weights of the others grow.
-    /// A sweep of unknown variance stays, however many that leaves.
-    fn drop_most_even(&mut self) {
+    /// Leaves out the sweeps with the lowest variance of their losses in each cluster, or random ones; the weights of the
+    /// others grow. A sweep of unknown variance stays, however many that leaves.
+    fn drop_redundant(&mut self) {
+        let variances: Vec<f32> = self.recorded.iter().map(|losses| variance(losses)).collect();
+        let order: Vec<f32> = match self.config.leave_out {
+            LeaveOut::EvenLoss => variances,
+            LeaveOut::Random => {
+                let rng = &mut self.rng;
+                // A random choice has the same chances: among sweeps of known variance.
+                variances.iter().map(|&known| if known < f32::MAX { rng.random() } else { f32::MAX }).collect()
+            }
+        };
         let classes = self.class_of_sweep.iter().max().map_or(0, |class| class + 1);
         for class in 0..classes {
             let used = |&sweep: &usize| self.class_of_sweep[sweep] == class && self.weights[sweep] > 0.0;
             let mut members: Vec<(f32, usize)> =
-                (0..self.weights.len()).filter(used).map(|sweep| (variance(&self.recorded[sweep]), sweep)).collect();
+                (0..self.weights.len()).filter(used).map(|sweep| (order[sweep], sweep)).collect();
             members.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
             let known = members.iter().take_while(|(variance, _)| *variance < f32::MAX).count();
             let dropped = ((members.len() as f64 * self.config.drop) as usize).min(known);
@@ -145,6 +179,23 @@ mod tests {
         assert!(redundancy.watches(0.4) && !redundancy.watches(0.2));
         assert!(redundancy.advance(0.9));
         assert_eq!(redundancy.weights(), [1.0; 8]);
+    }
+
+    #[test]
+    fn a_random_choice_leaves_out_as_many() {
+        let left_out = |seed| {
+            let config = RedundancyConfig { leave_out: LeaveOut::Random, seed, ..RedundancyConfig::default() };
+            let mut redundancy = Redundancy::new(config, vec![0; 8]);
+            for _ in 0..2 {
+                redundancy.record(&std::array::from_fn::<_, 8, _>(|sweep| (sweep, sweep as f32)));
+            }
+            assert!(redundancy.advance(0.25));
+            let unused = |&sweep: &usize| redundancy.weights()[sweep] == 0.0;
+            (0..8).filter(unused).collect::<Vec<usize>>()
+        };
+        let choices: Vec<_> = (0..8).map(left_out).collect();
+        assert!(choices.iter().all(|choice| choice.len() == 2), "{choices:?}");
+        assert!(choices.iter().any(|choice| *choice != choices[0]), "{choices:?}");
     }
 
     #[test]

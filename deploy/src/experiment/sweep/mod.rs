@@ -16,6 +16,7 @@ mod workers;
 use std::fs;
 use std::io::{self, BufRead, Write};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::Instant;
 
 use bus::config_file::ConfigError;
@@ -180,7 +181,7 @@ impl Sweep {
         if options.dry_run {
             return Ok(Swept::default());
         }
-        self.encode(&missing)?;
+        self.encode(&missing, options.jobs)?;
         self.compute(&missing, options.jobs)?;
         let cells: Option<Vec<Cell>> = self.known()?.into_iter().collect();
         let cells = cells.ok_or_else(|| SweepError::Worker("a run that was done is not there".into()))?;
@@ -222,7 +223,7 @@ impl Sweep {
     }
 
     /// Computes the feature maps of all sweeps, once for each encoder that is needed.
-    fn encode(&self, missing: &[usize]) -> Result<(), SweepError> {
+    fn encode(&self, missing: &[usize], jobs: usize) -> Result<(), SweepError> {
         let methods = missing.iter().map(|&index| self.points[index].method);
         let mut files = Vec::new();
         for method in methods.filter(|method| method.exchange() != Exchange::Points) {
@@ -234,10 +235,10 @@ impl Sweep {
         for file in files {
             let refused = |error: EvaluateError| SweepError::Evaluation(Box::new(error.into()));
             let weights = perception::weights::Weights::load(&file).map_err(|error| refused(error.into()))?;
-            let weights = weights.with_precision(self.experiment.precision);
+            let weights = Arc::new(weights.with_precision(self.experiment.precision));
             let bar = progress::bar(0, "sweeps encoded");
             let kept = cell::kept_maps(&self.experiment, &self.maps());
-            let store = FeatureStore::open(&kept, &weights, &self.all, &mut |stored, all| {
+            let store = FeatureStore::open(&kept, &weights, &self.all, jobs, &mut |stored, all| {
                 bar.set_length(all as u64);
                 bar.set_position(stored as u64);
             });

@@ -16,6 +16,7 @@ use fusion::model::{CooperativeModel, ModelError};
 pub(super) struct FrozenEncoder<'a> {
     kept: &'a KeptMaps,
     weights: Arc<Weights>,
+    threads: usize,
 }
 
 impl<'a> FrozenEncoder<'a> {
@@ -29,13 +30,13 @@ impl<'a> FrozenEncoder<'a> {
             }
         }
         let weights = Weights::load(init).map_err(ModelError::from)?.with_precision(InferencePrecision::Float);
-        Ok(Some(Self { kept, weights: Arc::new(weights) }))
+        Ok(Some(Self { kept, weights: Arc::new(weights), threads: config.run.loader_threads }))
     }
 
     /// The maps of all sweeps of some scenes; missing ones are encoded now.
     pub(super) fn maps(&self, scenes: &SceneSet, observer: &mut dyn Observer) -> Result<MapSource, TrainError> {
         let on_sweep = &mut |done, all| observer.encoded(done, all);
-        let open = FeatureStore::open(self.kept, &self.weights, scenes.scenarios(), on_sweep);
+        let open = FeatureStore::open(self.kept, &self.weights, scenes.scenarios(), self.threads, on_sweep);
         let store = open.map_err(|error: FeatureStoreError| SampleError::from(error))?;
         Ok(MapSource::new(Arc::new(store), Arc::clone(&self.weights)))
     }

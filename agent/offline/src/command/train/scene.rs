@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use agent_offline::training::{
-    RedundancyConfig, SceneReport, SceneSummary, SceneTrainConfig, SweepAugmentation, train_scene,
+    LeaveOut, RedundancyConfig, SceneReport, SceneSummary, SceneTrainConfig, SweepAugmentation, train_scene,
 };
 use perception::train::{ModelCard, TrainingBar, TrainingOptions};
 
@@ -57,9 +57,10 @@ pub(crate) struct Args {
     /// Largest rotation of such copies, degrees.
     #[arg(long, default_value_t = 10.0)]
     turn: f64,
-    /// Leave out sweeps with an even loss (RSD); trainings of fewer than some 14 passes are too short for it.
-    #[arg(long)]
-    rsd: bool,
+    /// Leave out a share of the sweeps in the middle of the training: those with an even loss (RSD), or random ones, its
+    /// control. Trainings of fewer than some 14 passes are too short for it.
+    #[arg(long, value_name = "CHOICE")]
+    leave_out: Option<LeaveOut>,
     /// Cells per step.
     #[arg(long, default_value_t = 4096)]
     batch: usize,
@@ -113,6 +114,7 @@ impl Args {
             return Err(bad("--copies and --validation-sweeps must be above zero"));
         }
         check_folders(self.scenes.iter().chain(&self.validation))?;
+        let run = run_config(&self.options, self.batch, self.lr)?;
         Ok(SceneTrainConfig {
             scenes: self.scenes.clone(),
             validation: self.validation.clone(),
@@ -126,8 +128,12 @@ impl Args {
             blocks: self.blocks,
             refiner: !self.no_refiner,
             augmentation: SweepAugmentation { copies: self.copies, turn_rad: self.turn.to_radians(), keep: 0.7 },
-            redundancy: self.rsd.then(RedundancyConfig::default),
-            run: run_config(&self.options, self.batch, self.lr)?,
+            redundancy: self.leave_out.map(|leave_out| RedundancyConfig {
+                leave_out,
+                seed: run.seed,
+                ..RedundancyConfig::default()
+            }),
+            run,
             validate_every: Duration::from_secs(self.validate_every),
         })
     }

@@ -1,0 +1,87 @@
+//! Sweep encoder: stored maps of sweeps by number, each thread with a network of its own.
+
+use std::io;
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use dataset::{LoadOptions, Scenario};
+use perception::detector::Detector;
+use perception::weights::Weights;
+use protocol::codec::encode_features;
+use protocol::message::Bev;
+use protocol::{BevFeatures, CavId, CodecConfig, Dtype, NoPoseReason, PoseEstimate, Stamp, WireError, wire};
+use tch::Device;
+
+use crate::feature_store::FeatureStoreError;
+
+/// zstd level of a message: more costs time and saves nothing.
+const ZSTD_LEVEL: i32 = 1;
+
+/// Encoder of the sweeps of some scenarios.
+pub(crate) struct SweepEncoder {
+    pub(crate) weights: Arc<Weights>,
+    pub(crate) scenarios: Arc<[Scenario]>,
+    /// Index of each scenario's first sweep, and of the end.
+    pub(crate) first: Arc<[usize]>,
+    /// Numeric type of the values.
+    pub(crate) dtype: Dtype,
+    /// The store, for messages of errors.
+    pub(crate) path: PathBuf,
+    /// Network of this thread, once there is one.
+    pub(crate) detector: Option<Detector>,
+}
+
+impl Clone for SweepEncoder {
+    /// The network is built anew where it is needed: every thread has its own.
+    fn clone(&self) -> Self {
+        Self {
+            weights: Arc::clone(&self.weights),
+            scenarios: Arc::clone(&self.scenarios),
+            first: Arc::clone(&self.first),
+            dtype: self.dtype,
+            path: self.path.clone(),
+            detector: None,
+        }
+    }
+}
+
+impl SweepEncoder {
+    /// The message of a sweep: by agent, then by tick within its scenario. Empty for a sweep that is absent or cannot
+    /// be read, and beyond the last.
+    ///
+    /// # Errors
+    /// Those of the network and of the wire format.
+    pub(crate) fn message(&mut self, sweep: usize) -> Result<Vec<u8>, FeatureStoreError> {
+        let scenario = self.first.partition_point(|&first| first <= sweep) - 1;
+        let Some(of) = self.scenarios.get(scenario) else { return Ok(Vec::new()) };
+        let within = sweep - self.first[scenario];
+        let (agent, tick) = (within / of.ticks.len(), within % of.ticks.len());
+        let Ok(frame) = of.load(agent, tick, &LoadOptions::default()) else { return Ok(Vec::new()) };
+        let detector = match &mut self.detector {
+            Some(detector) => detector,
+            None => {
+                let config = self.weights.config()?;
+                self.detector.insert(Detector::from_weights(&self.weights, &config, Device::Cpu)?)
+            }
+        };
+        let map = detector.encode(&frame.points)?.features;
+        let kept = detector.to_kept(&map)?;
+        self.packed(kept)
+    }
+}
+
+impl SweepEncoder {
+    fn packed(&self, features: BevFeatures) -> Result<Vec<u8>, FeatureStoreError> {
+        let codec = CodecConfig { dtype: self.dtype, zstd_level: Some(ZSTD_LEVEL), ..CodecConfig::default() };
+        // Sender and time of a map follow from its index.
+        let invalid = |_| FeatureStoreError::Io { path: self.path.clone(), source: io::ErrorKind::InvalidInput.into() };
+        let cav = CavId::new("0").map_err(invalid)?;
+        let stamp = Stamp { cav, epoch: 0, sequence: 0, capture_nanos: 0, publish_nanos: 0 };
+        let pose = PoseEstimate::NoPose { reason: NoPoseReason::NoSource, inlier_count: 0 };
+        let encode = || -> Result<_, WireError> {
+            let features = encode_features(features, &codec, None)?;
+            Ok(wire::encode(&stamp, Bev { pose, features })?.to_vec())
+        };
+        encode().map_err(|source| FeatureStoreError::Wire { path: self.path.clone(), source })
+    }
+}
