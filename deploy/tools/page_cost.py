@@ -63,7 +63,7 @@ class Page:
     """A viewer, and a reader of its stream."""
 
     def __init__(self, name, router):
-        command = [PROGRAMS / "v2vloc", "view", "--live", "--name", name, "--connect", router, "--listen", "127.0.0.1:0"]
+        command = [PROGRAMS / "v2vloc", "view", "--run", name, "--connect", router, "--listen", "127.0.0.1:0"]
         self.viewer = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
         self.address = line_with(self.viewer.stderr, r"http://([\d.:]+)/")[1]
         self.moments = 0

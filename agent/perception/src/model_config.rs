@@ -1,5 +1,7 @@
 //! Configuration of a detector: area, pillars, backbone, head.
 
+use std::path::PathBuf;
+
 use protocol::BevGrid;
 use serde::{Deserialize, Serialize};
 
@@ -18,6 +20,14 @@ pub enum ConfigError {
         value: String,
         /// Condition on the value.
         must: &'static str,
+    },
+    /// A module cannot be loaded.
+    #[error("{}: not a TorchScript module: {reason}", file.display())]
+    Script {
+        /// The file.
+        file: PathBuf,
+        /// First line of the tensor library's message.
+        reason: String,
     },
     /// Lists that describe the same levels differ in length.
     #[error("detector configuration: {field} has {got} entries, layer_nums has {levels}")]

@@ -16,7 +16,7 @@ use ego_fuser::misbehaviour::MisbehaviourConfig;
 use ego_fuser_offline::evaluation::stepped::{AgentPool, ComputeTimes, SteppedConfig};
 use fusion::Method;
 use indicatif::ProgressBar;
-use link::LinkConfig;
+use link::{CapacityConfig, DelayModel, LinkConfig};
 use localization::pose_source::PoseSourceConfig;
 use perception::int8::InferencePrecision;
 use protocol::CodecConfig;
@@ -47,8 +47,9 @@ pub(crate) struct Arguments {
     /// Instead: a file of tables, rows of methods and columns of conditions; cells that are done are kept in --out.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["dataset", "method", "weights"], requires = "out")]
     table: Option<PathBuf>,
-    /// Folder of the tables (--table).
-    #[arg(long, value_name = "DIR", requires = "table")]
+    /// Folder for detections.jsonl, truth.jsonl, frames.csv and precision_recall.csv of each method; with --table, of the
+    /// tables [default: nothing is written].
+    #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
     #[command(flatten, next_help_heading = "Pose")]
     pose: Section<PoseSourceConfig>,
@@ -60,21 +61,27 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "MS", default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=10_000))]
     delay: u64,
     /// Link emulation between neighbours and ego, in simulation time: a preset of `sim-replay link`, or a file.
-    #[arg(long, value_name = "PRESET|FILE", conflicts_with = "delay")]
+    #[arg(long, value_name = "PRESET|FILE", conflicts_with = "delay", group = "emulation")]
     link: Option<String>,
+    /// Rate of the link, Mbit/s; replaces that of --link.
+    #[arg(long, value_name = "MBPS", conflicts_with = "delay", group = "emulation")]
+    bandwidth: Option<f64>,
+    /// Delay of the link after the last bit, milliseconds; replaces that of --link.
+    #[arg(long, value_name = "MS", conflicts_with = "delay", group = "emulation")]
+    latency: Option<f64>,
     /// Same seed, same losses and delays (--link).
-    #[arg(long, default_value_t = 0, requires = "link")]
+    #[arg(long, default_value_t = 0, requires = "emulation")]
     seed: u64,
     /// Longest time that a frame waits for its neighbours, milliseconds (--link) [default: that of ego-fuser run].
-    #[arg(long, value_name = "MS", requires = "link")]
+    #[arg(long, value_name = "MS", requires = "emulation")]
     deadline_ms: Option<u64>,
     /// Largest age of a feature map that is still fused, by capture time, milliseconds (--link) [default: that of
     /// ego-fuser run].
-    #[arg(long, value_name = "MS", requires = "link")]
+    #[arg(long, value_name = "MS", requires = "emulation")]
     max_age_ms: Option<u64>,
     /// Compute time of pose, map and fusion, milliseconds, for example 20,60,30; without it no latency is reported
     /// (--link).
-    #[arg(long, value_name = "MS,MS,MS", value_delimiter = ',', num_args = 1, default_values_t = [0.0; 3], requires = "link")]
+    #[arg(long, value_name = "MS,MS,MS", value_delimiter = ',', num_args = 1, default_values_t = [0.0; 3], requires = "emulation")]
     compute: Vec<f64>,
     /// Attack by neighbours: falsified messages, to measure their effect on the ego.
     #[arg(long, value_enum, value_name = "ATTACK")]
@@ -149,7 +156,7 @@ impl Arguments {
 
     fn options(&self) -> Result<EvaluationOptions, BadInput> {
         self.pose.0.validate().map_err(bad)?;
-        if self.rate.0.watch_queue && self.link.is_none() {
+        if self.rate.0.watch_queue && !self.emulates_link() {
             return Err(BadInput::new("--watch-queue: without --link there is no queue to watch"));
         }
         let codec = self.codec.0;
@@ -175,14 +182,27 @@ impl Arguments {
                 intensity_scale: self.intensity_scale,
             }),
             frames: self.frames.map(at_most),
-            stepped: self.link.as_deref().map(|link| self.stepped(link)).transpose()?,
+            stepped: self.emulates_link().then(|| self.stepped()).transpose()?,
             part: Part { scenarios: self.scenarios.map(at_most), ticks: None, intensity_scale: self.intensity_scale },
             protocol: self.protocol.clone(),
+            out: self.out.clone(),
         })
     }
 
-    fn stepped(&self, link: &str) -> Result<SteppedConfig, BadInput> {
-        let (link, link_folder) = LinkConfig::open(link).map_err(BadInput::of)?;
+    fn emulates_link(&self) -> bool {
+        self.link.is_some() || self.bandwidth.is_some() || self.latency.is_some()
+    }
+
+    fn stepped(&self) -> Result<SteppedConfig, BadInput> {
+        let (mut link, link_folder) =
+            LinkConfig::open(self.link.as_deref().unwrap_or("ideal")).map_err(BadInput::of)?;
+        if let Some(rate_mbps) = self.bandwidth {
+            link.capacity = CapacityConfig::TokenBucket { rate_mbps, burst_bytes: 0 };
+        }
+        if let Some(latency_ms) = self.latency {
+            link.delay = DelayModel::ConstantMs(latency_ms);
+        }
+        link.validate().map_err(BadInput::of)?;
         let &[pose_ms, map_ms, fuse_ms] = &self.compute[..] else {
             return Err(BadInput::new(format!("--compute takes 3 numbers, not {}", self.compute.len())));
         };

@@ -14,11 +14,10 @@ mod up;
 mod view;
 
 use std::error::Error;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use anyhow::Context;
-use bus::BusError;
-use bus::malloc_settings;
+use bus::{Bus, BusError, BusOptions, Credentials, Endpoint, Identity, malloc_settings, process_id};
 use dataset::LeftOut;
 use deploy::experiment::evaluation::EvaluationError;
 use deploy::experiment::sweep::SweepError;
@@ -26,6 +25,7 @@ use deploy::experiment::table::TableError;
 use deploy::operate::RunError;
 use deploy::operate::fleet::FleetError;
 use deploy::scenario::ScenarioError;
+use protocol::{CavId, Role, RunId};
 use support::cli::Outcome;
 use support::output;
 
@@ -106,6 +106,19 @@ pub(crate) fn is_bad_input(cause: &(dyn Error + 'static)) -> bool {
         || BusError::is_behind(cause)
         || cause.downcast_ref::<SweepError>().is_some_and(SweepError::is_bad_input)
         || cause.downcast_ref::<RunError>().is_some_and(RunError::is_bad_input)
+}
+
+/// A connection to the router of a run as a viewer; `keys` where the run has security.
+fn viewer_bus(run: &RunId, router: &Endpoint, keys: Option<&Path>) -> anyhow::Result<Bus> {
+    let cav = CavId::new("viewer")?;
+    let identity = Identity { run: run.clone(), process: process_id(Role::Viewer, &cav), cav };
+    let mut options = BusOptions::client(router.clone());
+    if let Some(folder) = keys {
+        let credentials = Credentials::read(folder)?;
+        credentials.check_name(identity.process.as_str())?;
+        options = options.with_credentials(credentials);
+    }
+    Ok(Bus::join(&options, identity)?)
 }
 
 /// Folder of the programs: they are built and installed together.

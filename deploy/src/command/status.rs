@@ -1,20 +1,39 @@
 //! `v2vloc status`.
 
 use std::path::PathBuf;
+use std::time::Duration;
 
-use deploy::operate::status::RunStatus;
+use anyhow::ensure;
+use bus::Endpoint;
+use deploy::operate::remote_status::RemoteStatus;
+use deploy::operate::status::{RunStatus, StatusError};
+use protocol::RunId;
 use support::output;
 
+use super::viewer_bus;
 use support::cli::BadInput;
 use support::cli::Outcome;
+
+/// Time of observation: processes report twice a second.
+const OBSERVED: Duration = Duration::from_millis(2500);
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct Arguments {
     /// Folder of the run [default: the one in --runs with the newest status].
+    #[arg(conflicts_with = "connect")]
     run: Option<PathBuf>,
     /// Folder of the run folders.
     #[arg(long, default_value = "runs")]
     runs: PathBuf,
+    /// Router of a run without a folder here, tcp/HOST:PORT: its processes are observed for 2.5 s.
+    #[arg(long, requires = "name", value_name = "ENDPOINT")]
+    connect: Option<Endpoint>,
+    /// Name of the run (--connect).
+    #[arg(long = "run", id = "name", requires = "connect", value_name = "NAME")]
+    name: Option<RunId>,
+    /// Folder with the viewer's keys, where the run has security (--connect).
+    #[arg(long, value_name = "DIR", requires = "connect")]
+    keys: Option<PathBuf>,
     /// Print JSON instead of a table.
     #[arg(long)]
     json: bool,
@@ -23,16 +42,30 @@ pub(crate) struct Arguments {
 impl Arguments {
     /// Prints the state of the run.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
-        let bad_input = |error: deploy::operate::status::StatusError| BadInput::of(error);
-        let folder = RunStatus::folder(self.run, &self.runs).map_err(bad_input)?;
-        let status = RunStatus::read(&folder).map_err(bad_input)?;
-        if self.json {
-            output::line(serde_json::to_string_pretty(&status)?)?;
-        } else {
-            output::text(status.table())?;
+        if let (Some(router), Some(name)) = (&self.connect, &self.name) {
+            let bus = viewer_bus(name, router, self.keys.as_deref())?;
+            let status = RemoteStatus::observe(&bus, OBSERVED)?;
+            self.print(&status, &status.table())?;
+            return well(&status.run, &status.troubles());
         }
-        let troubles = status.troubles();
-        anyhow::ensure!(troubles.is_empty(), "run {} is not well: {}", status.run, troubles.join("; "));
-        Ok(Outcome::Done)
+        let bad_input = |error: StatusError| BadInput::of(error);
+        let folder = RunStatus::folder(self.run.clone(), &self.runs).map_err(bad_input)?;
+        let status = RunStatus::read(&folder).map_err(bad_input)?;
+        self.print(&status, &status.table())?;
+        well(&status.run, &status.troubles())
     }
+
+    fn print(&self, status: &impl serde::Serialize, table: &str) -> anyhow::Result<()> {
+        if self.json {
+            output::line(serde_json::to_string_pretty(status)?)?
+        } else {
+            output::text(table)?
+        }
+        Ok(())
+    }
+}
+
+fn well(run: &str, troubles: &[String]) -> anyhow::Result<Outcome> {
+    ensure!(troubles.is_empty(), "run {run} is not well: {}", troubles.join("; "));
+    Ok(Outcome::Done)
 }

@@ -5,14 +5,15 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use bus::Endpoint;
 use bus::shutdown::Stop;
 use bus::web::WebServer;
-use bus::{Bus, BusOptions, Credentials, Endpoint, Identity, process_id};
 use deploy::operate::status::{Phase, RunStatus};
 use deploy::view::{LiveRun, RecordedRun, ViewError, serve_live, serve_recorded};
-use protocol::{CavId, Role, RunId};
+use protocol::RunId;
 use support::output;
 
+use super::viewer_bus;
 use support::cli::BadInput;
 use support::cli::Outcome;
 
@@ -24,22 +25,19 @@ const VIEWER_NICENESS: i32 = 15;
 pub(crate) struct Arguments {
     /// Folder of a run, or its name in --runs: shown live while it goes on, otherwise from its recording (`v2vloc up
     /// --record`); or a recording.mcap [default: the newest run in --runs].
-    #[arg(conflicts_with = "live")]
+    #[arg(conflicts_with = "connect")]
     run: Option<PathBuf>,
     /// Folder of the run folders.
     #[arg(long, default_value = "runs")]
     runs: PathBuf,
-    /// Show a live run without a folder here, which --name and --connect identify.
-    #[arg(long, requires_all = ["name", "connect"])]
-    live: bool,
-    /// Name of the live run.
-    #[arg(long)]
-    name: Option<RunId>,
-    /// Router of the live run, tcp/HOST:PORT; `v2vloc up` prints it.
-    #[arg(long)]
+    /// Router of a live run without a folder here, tcp/HOST:PORT; `v2vloc up` prints it.
+    #[arg(long, requires = "name", value_name = "ENDPOINT")]
     connect: Option<Endpoint>,
-    /// Folder with the viewer's keys, where the live run has security (`v2vloc keys` writes DIR/viewer).
-    #[arg(long, value_name = "DIR")]
+    /// Name of the run (--connect).
+    #[arg(long = "run", id = "name", requires = "connect", value_name = "NAME")]
+    name: Option<RunId>,
+    /// Folder with the viewer's keys, where the run has security; `v2vloc keys` writes DIR/viewer (--connect).
+    #[arg(long, value_name = "DIR", requires = "connect")]
     keys: Option<PathBuf>,
     /// Address of the page.
     #[arg(long, value_name = "HOST:PORT", default_value = "127.0.0.1:8088")]
@@ -63,15 +61,7 @@ impl Arguments {
             Shown::Live(name, router) => {
                 // On the machine of the run, the run has priority.
                 let _ = rustix::process::nice(VIEWER_NICENESS);
-                let cav = CavId::new("viewer")?;
-                let identity = Identity { run: name, process: process_id(Role::Viewer, &cav), cav };
-                let mut options = BusOptions::client(router);
-                if let Some(folder) = &self.keys {
-                    let credentials = Credentials::read(folder)?;
-                    credentials.check_name(identity.process.as_str())?;
-                    options = options.with_credentials(credentials);
-                }
-                let bus = Bus::join(&options, identity)?;
+                let bus = viewer_bus(&name, &router, self.keys.as_deref())?;
                 serve_live(self.listen, Arc::new(LiveRun::start(bus)?))
             }
         };

@@ -20,6 +20,7 @@ use perception::weights::Weights;
 use protocol::{CavId, CodecConfig};
 use training::feature_store::{FeatureStore, KeptMaps, MapSource};
 
+use crate::experiment::frame_files::{FrameFiles, FrameFilesError};
 use crate::scenario::weights_choice::{WeightsChoiceError, weights_of};
 use crate::score::FrameScores;
 use crate::score::evaluated_frame::judge;
@@ -56,6 +57,9 @@ pub struct EvaluationOptions {
     pub part: Part,
     /// Participating vehicles, counted annotations and objects.
     pub protocol: ProtocolConfig,
+    /// Folder for detections, ground truth, a row per frame, and precision over recall, a folder per method in it;
+    /// absent: none are written.
+    pub out: Option<PathBuf>,
 }
 
 /// Data set, opened for evaluation by a protocol.
@@ -129,6 +133,9 @@ pub enum EvaluationError {
     /// Error of the pipeline.
     #[error(transparent)]
     Evaluate(#[from] EvaluateError),
+    /// The frames' results cannot be written.
+    #[error(transparent)]
+    Files(#[from] FrameFilesError),
 }
 
 /// Number of frames to evaluate in a data set, over all scenarios.
@@ -193,6 +200,7 @@ pub(crate) fn judged(
     // Without a compute time, a result is as old as its sweep by definition, which is no latency.
     let is_timed = options.stepped.as_ref().is_some_and(|stepped| stepped.compute != ComputeTimes::NONE);
     let mut board: Option<FrameScores> = None;
+    let mut files = options.out.as_ref().map(|out| FrameFiles::create(out, method)).transpose()?;
     for scenario in options.part.chosen(&scenarios) {
         let Some(ego) = scenario.agents.first() else { continue };
         if !scenario.has_poses(0, 0) {
@@ -201,9 +209,14 @@ pub(crate) fn judged(
         let board = board.get_or_insert_with(|| FrameScores::new(ego.clone(), *evaluator.rule(), map_values));
         board.change_ego(ego);
         let judged = evaluator.run(scenario, &mut |frame| {
+            let is_written = files.as_mut().is_none_or(|files| files.add(&scenario.name, &frame));
             judge(board, frame, is_timed);
             on_frame();
-            if board.records().len() >= left { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+            if board.records().len() >= left || !is_written {
+                ControlFlow::Break(())
+            } else {
+                ControlFlow::Continue(())
+            }
         })?;
         if judged.is_break() {
             break;
@@ -211,6 +224,7 @@ pub(crate) fn judged(
     }
     let board =
         board.filter(|board| !board.records().is_empty()).ok_or(EvaluationError::Empty(options.dataset.clone()))?;
+    files.map(|files| files.finish(&board)).transpose()?;
     Ok((board, evaluator, began))
 }
 

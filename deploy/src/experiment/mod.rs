@@ -1,6 +1,7 @@
 //! Experiments: evaluation, tables and sweeps, and their metrics and reports.
 
 pub mod evaluation;
+mod frame_files;
 pub mod report;
 pub mod sweep;
 pub mod table;

@@ -9,6 +9,7 @@ pub mod fleet;
 pub mod health;
 pub mod keys;
 pub mod network;
+pub mod remote_status;
 pub mod run_folder;
 pub mod security;
 pub mod status;

@@ -128,18 +128,21 @@ impl RunFolder {
     /// # Errors
     /// [`RunFolderError::Write`].
     pub fn write_frames(&self, records: &[FrameRecord], swept: &BTreeMap<u64, u64>) -> Result<(), RunFolderError> {
-        self.write("frames.csv", &frames_csv(records, swept))
+        self.write("frames.csv", &frames_csv(records, swept, None))
     }
 }
 
-/// The table of a run's ticks: a header line, then a line per tick, answered or not.
-fn frames_csv(records: &[FrameRecord], swept: &BTreeMap<u64, u64>) -> String {
-    let mut text = CsvText::new(
-        "tick,agent_frame,capture_nanos,latency_ms,detected,truth,found,fused,skipped,oldest_ms,stale,payload_bytes,wire_bytes,ego_error_m,\
+/// The table of ticks: a header line, then a line per tick, answered or not. With the scenario of each tick, that is the
+/// first column.
+pub(crate) fn frames_csv(records: &[FrameRecord], swept: &BTreeMap<u64, u64>, scenarios: Option<&[String]>) -> String {
+    let header = "tick,agent_frame,capture_nanos,latency_ms,detected,truth,found,fused,skipped,oldest_ms,stale,payload_bytes,wire_bytes,ego_error_m,\
          ego_error_deg,swept_ms,posed_ms,published_ms,arrived_ms,decided_ms,fused_ms,detected_ms,answered,tick_unix_nanos,\
-         streamed_tick,streamed_age_ms,streamed_detected,streamed_found",
-    );
-    records.iter().for_each(|record| text.row(frame_fields(record, swept)));
+         streamed_tick,streamed_age_ms,streamed_detected,streamed_found";
+    let mut text = CsvText::new(&scenarios.map_or_else(|| header.to_owned(), |_| format!("scenario,{header}")));
+    for (place, record) in records.iter().enumerate() {
+        let scenario = scenarios.and_then(|scenarios| scenarios.get(place)).cloned();
+        text.row(scenario.into_iter().chain(frame_fields(record, swept)));
+    }
     text.finish()
 }
 
@@ -255,7 +258,7 @@ mod tests {
             streamed: Some(StreamedResult { tick: 1, age_ms: 200.5, detected: 15, found: 12 }),
         };
         let unanswered = FrameRecord { agent_frame: None, latency_ms: None, streamed: None, ..record.clone() };
-        let text = frames_csv(&[record, unanswered], &BTreeMap::from([(300_000_000, 1_002_500_000)]));
+        let text = frames_csv(&[record, unanswered], &BTreeMap::from([(300_000_000, 1_002_500_000)]), None);
         let lines: Vec<&str> = text.lines().collect();
         assert_eq!(
             lines[1],

@@ -4,8 +4,6 @@
 //! number of processes.
 
 use std::collections::BTreeSet;
-use std::fs::File;
-use std::io::{BufWriter, Write};
 use std::ops::ControlFlow;
 use std::path::PathBuf;
 
@@ -15,7 +13,7 @@ use ego_fuser_offline::evaluation::stepped::{AgentPool, ComputeTimes, SteppedCon
 use ego_fuser_offline::evaluation::{EvaluateConfig, EvaluateError, EvaluatedFrame, Evaluator};
 use link::LinkConfig;
 use localization::pose_source::PoseSourceConfig;
-use protocol::{CavId, DetectionsReport, RunId};
+use protocol::{CavId, RunId};
 use support::progress;
 
 use crate::operate::RunError;
@@ -29,7 +27,7 @@ use crate::scenario::fingerprint::Provenance;
 use crate::scenario::{Scenario, Stepped};
 use crate::score::evaluated_frame::judge;
 use crate::score::metrics::Metrics;
-use crate::score::{FrameScores, TruthLine};
+use crate::score::{FrameLines, FrameScores};
 
 /// Runs a scenario in simulation time to its end.
 ///
@@ -146,36 +144,18 @@ fn play(
     folder: &RunFolder,
 ) -> Result<FrameScores, RunError> {
     let mut board = FrameScores::new(fleet.ego.clone(), fleet.ground_truth_rule(), fleet.map_values());
-    let path = folder.file("detections.jsonl");
-    let unwritable = |source| RunFolderError::Write { path: path.clone(), source };
-    let mut file = BufWriter::new(File::create(&path).map_err(unwritable)?);
-    let mut truth = BufWriter::new(File::create(folder.file("truth.jsonl")).map_err(unwritable)?);
+    let unwritable = |source| RunFolderError::Write { path: folder.path().to_owned(), source };
+    let mut lines = FrameLines::create(folder.path()).map_err(unwritable)?;
     let bar = progress::bar(fleet.ticks.unwrap_or(0), "ticks");
-    let mut written = Ok(());
     let _ = evaluator.run(recorded, &mut |frame: EvaluatedFrame| {
         bar.inc(1);
-        let report = DetectionsReport::new(&frame.stamp, Some(frame.tick as u64), frame.result.clone());
-        let of_truth = truth_line(&fleet.ego, &frame).to_json();
-        written = writeln!(file, "{}", report.to_json()).and_then(|()| writeln!(truth, "{of_truth}"));
+        let is_written = lines.add(None, &frame);
         judge(&mut board, frame, true);
-        if written.is_ok() { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
+        if is_written { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
     })?;
     bar.finish_and_clear();
-    written.and_then(|()| file.flush()).and_then(|()| truth.flush()).map_err(unwritable)?;
+    lines.finish().map_err(unwritable)?;
     Ok(board)
-}
-
-/// Ground truth of a computed tick.
-fn truth_line(ego: &CavId, frame: &EvaluatedFrame) -> TruthLine {
-    let own = frame.frames.iter().find(|recorded| recorded.cav == *ego);
-    TruthLine {
-        tick: frame.tick as u64,
-        capture_nanos: frame.stamp.capture_nanos,
-        publish_nanos: frame.stamp.capture_nanos,
-        ego: ego.clone(),
-        world_from_ego: own.and_then(|recorded| recorded.world_from_lidar),
-        boxes: frame.objects.clone(),
-    }
 }
 
 fn write(

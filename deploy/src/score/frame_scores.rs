@@ -10,7 +10,7 @@ use super::frame_record::{FrameRecord, JudgedFrame, StreamedResult};
 use super::live_precision::{Answer, LivePrecision, TickTruth};
 use super::neighbours::{self, NeighbourRecord};
 use super::open_ticks::{OpenTicks, Part, Tick};
-use super::precision::{by_iou, found_by_last};
+use super::precision::{by_iou, found_by_last, precision_recall_csv};
 use super::stage_stamps::StageStamps;
 use super::true_boxes::true_boxes;
 use super::truth_line::TruthLine;
@@ -129,6 +129,13 @@ impl FrameScores {
     #[must_use]
     pub fn average_precision(&self) -> (ByIou, ByIou) {
         (by_iou(&self.scorer, Ordering::Global), by_iou(&self.scorer, Ordering::Frame))
+    }
+
+    /// Precision over recall at the three IoU thresholds as a table, a row per detection by falling score; precision is
+    /// made non-increasing in recall, as for [`Self::average_precision`].
+    #[must_use]
+    pub(crate) fn precision_recall_csv(&self) -> String {
+        precision_recall_csv(&self.scorer)
     }
 
     /// Average precision over all ticks, ordered by score; one without a result is a frame without detections.

@@ -1,6 +1,7 @@
 //! Score of a run: detections against the truth, poses, latencies, bytes, and message accounting.
 
 pub(crate) mod evaluated_frame;
+mod frame_lines;
 mod frame_record;
 mod frame_scores;
 mod live_precision;
@@ -16,6 +17,7 @@ mod stage_stamps;
 mod true_boxes;
 mod truth_line;
 
+pub(crate) use frame_lines::FrameLines;
 pub use frame_record::FrameRecord;
 
 pub(crate) use frame_record::{JudgedFrame, StreamedResult};

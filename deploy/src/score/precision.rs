@@ -1,5 +1,6 @@
 //! Average precision and hits of a scorer.
 
+use support::csv_file::CsvText;
 use training::average_precision::{Ordering, Scorer};
 
 use crate::score::metrics::ByIou;
@@ -14,6 +15,23 @@ pub(super) fn by_iou(scorer: &Scorer, ordering: Ordering) -> ByIou {
         [at_30, at_50, at_70] if objects > 0 => ByIou { at_30: Some(at_30), at_50: Some(at_50), at_70: Some(at_70) },
         _ => ByIou::default(),
     }
+}
+
+/// Precision over recall, ordered by score: a row per detection.
+pub(super) fn precision_recall_csv(scorer: &Scorer) -> String {
+    let mut text = CsvText::new("iou,score,recall,precision");
+    for tally in scorer.tallies() {
+        let curve = tally.curve(Ordering::Global);
+        let mut scores: Vec<f32> = tally.matched.iter().map(|matched| matched.score).collect();
+        scores.sort_by(|a, b| b.total_cmp(a));
+        // The curve has a point more at each end.
+        let points = curve.recall.iter().zip(&curve.precision).skip(1);
+        for (score, (recall, precision)) in scores.iter().zip(points) {
+            let numbers = [f64::from(*score), *recall, *precision].map(|number| format!("{number:.6}"));
+            text.row([tally.iou_threshold.to_string()].into_iter().chain(numbers));
+        }
+    }
+    text.finish()
 }
 
 /// Number of the last `detected` detections of a scorer that overlap a true box by at least [`FOUND_IOU`].

@@ -49,6 +49,7 @@ pub mod pastat;
 pub mod planar_fit;
 pub mod points;
 pub mod pose_graph;
+mod script;
 pub mod settings;
 pub mod spec;
 pub mod swap_fusion;

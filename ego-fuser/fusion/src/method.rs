@@ -1,11 +1,13 @@
 //! The table of collaboration methods, and [`Method`], a handle to one of them.
 
 use std::borrow::Cow;
+use std::ffi::OsStr;
 use std::fmt;
 use std::hash::{Hash, Hasher};
 use std::str::FromStr;
 
-use clap::builder::{PossibleValue, PossibleValuesParser, TryMapValueParser, TypedValueParser, ValueParserFactory};
+use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser, ValueParserFactory};
+use clap::{Arg, Command};
 use perception::model_config::DetectorConfig;
 use protocol::ConfidenceGate;
 use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
@@ -13,8 +15,8 @@ use serde::de::Error;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use crate::{
-    FusionConfig, MethodSpec, attention, coalign, cobevt, disconet, ermvp, max, own, pastat, traf_align, v2vnet,
-    v2xvit, where2comm,
+    FusionConfig, MethodSpec, attention, coalign, cobevt, disconet, ermvp, max, own, pastat, script, traf_align,
+    v2vnet, v2xvit, where2comm,
 };
 
 pub use crate::Exchange;
@@ -111,26 +113,27 @@ impl Method {
     /// Default settings of its fusion behind a detector; methods that exchange no feature maps fuse none.
     #[must_use]
     pub fn default_fusion(self, detector: &DetectorConfig) -> FusionConfig {
-        (self.0.fusion.default_config)(detector)
+        (self.0.fusion.default_config)(self.0, detector)
     }
 
-    /// True if the settings belong to its fusion.
+    /// True if the settings of a weights file are to be used for its fusion. A script's file is that of its name.
     #[must_use]
     pub(crate) fn has_fusion(self, config: &FusionConfig) -> bool {
-        self.0.fusion.kind == config.kind()
+        self.0.fusion.kind == config.kind() && config.kind() != script::FUSION.kind
     }
 }
 
 /// A name that no method has.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("no method is called {0:?}; there are {names}", names = Method::ALL.map(Method::name).join(", "))]
+#[error("no method is called {0:?}; there are {names} and script:FILE.pt", names = Method::ALL.map(Method::name).join(", "))]
 pub struct UnknownMethod(String);
 
 impl FromStr for Method {
     type Err = UnknownMethod;
 
     fn from_str(text: &str) -> Result<Self, UnknownMethod> {
-        Self::ALL.into_iter().find(|method| method.name() == text).ok_or_else(|| UnknownMethod(text.to_owned()))
+        let of_table = Self::ALL.into_iter().find(|method| method.name() == text);
+        of_table.or_else(|| script::spec(text).map(Self)).ok_or_else(|| UnknownMethod(text.to_owned()))
     }
 }
 
@@ -166,10 +169,11 @@ impl JsonSchema for Method {
     }
 
     fn json_schema(_: &mut SchemaGenerator) -> Schema {
-        let names: Vec<Schema> = Self::ALL
+        let mut names: Vec<Schema> = Self::ALL
             .iter()
             .map(|method| json_schema!({"const": method.name(), "description": method.summary()}))
             .collect();
+        names.push(json_schema!({"pattern": "^script:.+", "description": "A TorchScript file, script:FILE.pt."}));
         json_schema!({"description": "How the views of several CAVs become one set of boxes.", "oneOf": names})
     }
 }
@@ -188,19 +192,47 @@ impl<'de> Deserialize<'de> for Method {
 
 /// For command lines: `--help` and the error for an unknown name list the names.
 impl ValueParserFactory for Method {
-    type Parser = TryMapValueParser<PossibleValuesParser, fn(String) -> Result<Self, UnknownMethod>>;
+    type Parser = MethodParser;
 
     fn value_parser() -> Self::Parser {
-        let values = Self::ALL.map(|method| PossibleValue::new(method.name()).help(method.summary()));
-        PossibleValuesParser::new(values).try_map(|name| name.parse())
+        MethodParser
     }
+}
+
+/// Parser of a method on a command line.
+#[derive(Debug, Clone, Copy)]
+pub struct MethodParser;
+
+impl TypedValueParser for MethodParser {
+    type Value = Method;
+
+    fn parse_ref(&self, command: &Command, argument: Option<&Arg>, value: &OsStr) -> Result<Method, clap::Error> {
+        let script = value.to_str().filter(|text| text.starts_with(script::PREFIX));
+        match script.and_then(|text| text.parse().ok()) {
+            Some(method) => Ok(method),
+            None => {
+                let of_table = PossibleValuesParser::new(of_table()).try_map(|name| name.parse::<Method>());
+                of_table.parse_ref(command, argument, value)
+            }
+        }
+    }
+
+    fn possible_values(&self) -> Option<Box<dyn Iterator<Item = PossibleValue> + '_>> {
+        let script = PossibleValue::new("script:FILE.pt").help("feature maps, fused by a TorchScript module");
+        Some(Box::new(of_table().into_iter().chain([script])))
+    }
+}
+
+fn of_table() -> Vec<PossibleValue> {
+    Method::ALL.map(|method| PossibleValue::new(method.name()).help(method.summary())).to_vec()
 }
 
 impl<'de> Deserialize<'de> for FusionConfig {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
         let mut fields = serde_json::Map::deserialize(deserializer)?;
         let kind = fields.remove("kind").ok_or_else(|| D::Error::missing_field("kind"))?;
-        let fusion = Method::ALL.map(|method| method.spec().fusion).into_iter().find(|fusion| kind == fusion.kind);
+        let known = Method::ALL.into_iter().map(|method| method.spec().fusion).chain([script::FUSION]);
+        let fusion = known.into_iter().find(|fusion| kind == fusion.kind);
         let fusion = fusion.ok_or_else(|| D::Error::custom(format_args!("unknown kind of fusion {kind}")))?;
         (fusion.parse)(fields.into()).map_err(D::Error::custom)
     }

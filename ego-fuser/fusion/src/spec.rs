@@ -44,7 +44,7 @@ pub struct FusionSpec {
     /// Tag of its settings in weights files.
     pub kind: &'static str,
     /// Default settings behind a detector.
-    pub default_config: fn(&DetectorConfig) -> FusionConfig,
+    pub default_config: fn(&MethodSpec, &DetectorConfig) -> FusionConfig,
     /// Reads the settings of a weights file, without their tag.
     pub parse: fn(serde_json::Value) -> Result<FusionConfig, serde_json::Error>,
 }
@@ -55,7 +55,7 @@ impl FusionSpec {
     pub const fn of<S: FusionSettings>() -> Self {
         Self {
             kind: S::KIND,
-            default_config: |detector| FusionConfig::new(S::for_detector(detector)),
+            default_config: |_, detector| FusionConfig::new(S::for_detector(detector)),
             parse: |fields| serde_json::from_value::<S>(fields).map(FusionConfig::new),
         }
     }

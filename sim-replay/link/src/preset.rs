@@ -41,6 +41,13 @@ impl LinkConfig {
         Ok((config, folder))
     }
 
+    /// Every field with its value, as a file for [`Self::open`].
+    #[must_use]
+    pub fn to_yaml(&self) -> String {
+        // Numbers, names and lists have a spelling in YAML.
+        serde_saphyr::to_string(self).unwrap_or_default()
+    }
+
     /// A published link model, by name.
     ///
     /// # Errors
@@ -108,7 +115,9 @@ mod tests {
     #[test]
     fn every_preset_is_sound() {
         for (name, _) in PRESETS {
-            LinkConfig::preset(name).unwrap().validate().unwrap();
+            let link = LinkConfig::preset(name).unwrap();
+            link.validate().unwrap();
+            assert_eq!(serde_saphyr::from_str::<LinkConfig>(&link.to_yaml()).unwrap(), link, "{}", link.to_yaml());
         }
         let message = LinkConfig::preset("6g").unwrap_err().to_string();
         assert!(PRESETS.iter().all(|(name, _)| message.contains(name)), "{message}");

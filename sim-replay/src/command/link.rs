@@ -2,7 +2,8 @@
 
 use anyhow::Context;
 use bus::{Configured, STOP_LIMIT, log_to_stderr};
-use link::LinkEmulator;
+use clap::{Arg, ArgMatches, Command, FromArgMatches};
+use link::{LinkConfig, LinkEmulator};
 use protocol::Role;
 use sim_replay::config::LinkProcessConfig;
 use sim_replay::link_node::{self, LinkReport, NodeOptions};
@@ -11,8 +12,16 @@ use support::output;
 use support::cli::Outcome;
 
 /// Forward the agents' messages to an ego as a wireless link would: delayed, queued or lost.
+#[derive(Debug)]
+pub(crate) enum Args {
+    /// Forwards messages.
+    Forward(Box<ForwardArgs>),
+    /// Prints a link by its name or file.
+    Print(String),
+}
+
 #[derive(Debug, clap::Args)]
-pub(crate) struct Args {
+pub(crate) struct ForwardArgs {
     #[command(flatten)]
     config: Configured<LinkProcessConfig>,
     /// Print a JSON summary.
@@ -20,8 +29,47 @@ pub(crate) struct Args {
     json: bool,
 }
 
-/// Forwards messages and prints a summary to standard output.
+impl clap::Args for Args {
+    fn augment_args(command: Command) -> Command {
+        let print = Arg::new("print").long("print").value_name("PRESET|FILE").exclusive(true);
+        let help = "Print a link as YAML, every field with its value, and exit: a start for a file of one's own";
+        ForwardArgs::augment_args(command).arg(print.help(help))
+    }
+
+    fn augment_args_for_update(command: Command) -> Command {
+        Self::augment_args(command)
+    }
+}
+
+impl FromArgMatches for Args {
+    fn from_arg_matches(matches: &ArgMatches) -> Result<Self, clap::Error> {
+        match matches.get_one::<String>("print") {
+            Some(name) => Ok(Self::Print(name.clone())),
+            None => ForwardArgs::from_arg_matches(matches).map(|args| Self::Forward(Box::new(args))),
+        }
+    }
+
+    fn update_from_arg_matches(&mut self, matches: &ArgMatches) -> Result<(), clap::Error> {
+        *self = Self::from_arg_matches(matches)?;
+        Ok(())
+    }
+}
+
+/// Forwards messages and prints a summary to standard output, or prints a link.
 pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
+    match args {
+        Args::Forward(args) => forward(*args),
+        Args::Print(name) => match LinkConfig::open(&name) {
+            Ok((link, _)) => {
+                output::text(link.to_yaml())?;
+                Ok(Outcome::Done)
+            }
+            Err(error) => Ok(Outcome::bad_input(&error)),
+        },
+    }
+}
+
+fn forward(args: ForwardArgs) -> anyhow::Result<Outcome> {
     log_to_stderr();
     let config = match args.config.validated() {
         Ok(config) => config,

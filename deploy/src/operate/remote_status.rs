@@ -1,0 +1,258 @@
+//! Remote status: the processes of a run as its router shows them, without the folder of the run.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::time::{Duration, Instant};
+
+use bus::bounded_queue::Pop;
+use bus::{Bus, BusError, present};
+use protocol::{CavId, Detections, KeyExpr, Limits, Stats, Stream, Topic, wire};
+use serde::Serialize;
+use support::text_table::{Side, TextTable};
+
+/// Queued messages of a topic.
+const PLACES: usize = 64;
+
+/// State of one process.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum RemoteState {
+    /// It is connected and reports.
+    Alive,
+    /// It is connected, and no report of it has arrived.
+    Silent,
+    /// It has left since its last report.
+    Gone,
+}
+
+/// A process of a run.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct RemoteProcess {
+    /// Name in messages.
+    pub name: String,
+    /// State.
+    pub state: RemoteState,
+    /// Cores in use, between its reports; `None` with fewer than two.
+    pub cores: Option<f64>,
+    /// Resident memory, MiB.
+    pub resident_mib: Option<f64>,
+    /// Number of messages that it has sent.
+    pub sent: Option<u64>,
+    /// Number of messages of which it knows that they were dropped.
+    pub dropped: Option<u64>,
+}
+
+/// Results of one ego while it was observed.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct RemoteEgo {
+    /// The ego.
+    pub ego: CavId,
+    /// Results per second.
+    pub rate_hz: f64,
+    /// From the publication of a tick to that of its result, milliseconds, of the last result; `None` without a replay.
+    pub latency_ms: Option<f64>,
+    /// Number of neighbours in the last result.
+    pub fused: usize,
+}
+
+/// Status of a run, observed for a short time.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct RemoteStatus {
+    /// Name of the run.
+    pub run: String,
+    /// Time of observation, seconds.
+    pub observed_s: f64,
+    /// Processes, by name.
+    pub processes: Vec<RemoteProcess>,
+    /// Egos with results.
+    pub egos: Vec<RemoteEgo>,
+}
+
+impl RemoteStatus {
+    /// Observes the run of `bus` for some time; longer than a second, or processes seem silent.
+    ///
+    /// # Errors
+    /// [`BusError`] when the session is closed.
+    pub fn observe(bus: &Bus, time: Duration) -> Result<Self, BusError> {
+        let run = &bus.identity().run;
+        let selectors = [KeyExpr::stats(run), KeyExpr::stream(run, Stream::Detections), KeyExpr::truth(run)];
+        let tap = bus.tap(&selectors, PLACES)?;
+        let mut seen = Seen::default();
+        let end = Instant::now() + time;
+        while let Pop::Item(topic, message) = tap.take(Some(end)) {
+            seen.add(&topic, &message.pieces());
+        }
+        let own = &bus.identity().process;
+        let alive =
+            present(bus.session(), run)?.iter().filter(|process| *process != own).map(ToString::to_string).collect();
+        Ok(seen.status(run.to_string(), time, &alive))
+    }
+
+    /// Problems as text.
+    #[must_use]
+    pub fn troubles(&self) -> Vec<String> {
+        if self.processes.is_empty() {
+            return vec!["no process of it is connected to this router".to_owned()];
+        }
+        let trouble = |process: &RemoteProcess| match process.state {
+            RemoteState::Alive => None,
+            RemoteState::Silent => Some(format!("{} is silent", process.name)),
+            RemoteState::Gone => Some(format!("{} has left", process.name)),
+        };
+        self.processes.iter().filter_map(trouble).collect()
+    }
+
+    /// The status as text for a terminal.
+    #[must_use]
+    pub fn table(&self) -> String {
+        let left = ["process", "state"].map(|name| (name, Side::Left));
+        let right = ["cores", "MiB", "sent", "dropped"].map(|name| (name, Side::Right));
+        let mut table = TextTable::new(left.into_iter().chain(right));
+        for RemoteProcess { name, state, cores, resident_mib, sent, dropped } in &self.processes {
+            let count = |count: &Option<u64>| count.map_or("-".to_owned(), |count| count.to_string());
+            let state = match state {
+                RemoteState::Alive => "alive",
+                RemoteState::Silent => "silent",
+                RemoteState::Gone => "gone",
+            };
+            table.row([
+                name.clone(),
+                state.to_owned(),
+                number(*cores, 2),
+                number(*resident_mib, 0),
+                count(sent),
+                count(dropped),
+            ]);
+        }
+        let results: String = self.egos.iter().map(result_line).collect();
+        format!("{}, observed for {:.1} s\n{results}{table}", self.run, self.observed_s)
+    }
+}
+
+fn result_line(RemoteEgo { ego, rate_hz, latency_ms, fused }: &RemoteEgo) -> String {
+    format!("ego {ego}: {rate_hz:.1} results a second, latency {} ms, {fused} fused\n", number(*latency_ms, 0))
+}
+
+fn number(value: Option<f64>, digits: usize) -> String {
+    value.map_or("-".into(), |value| format!("{value:.digits$}"))
+}
+
+/// Messages seen so far.
+#[derive(Debug, Default)]
+struct Seen {
+    /// First and last report of each process, with the times on the sender's clock, nanoseconds.
+    reports: BTreeMap<String, [(u64, Stats); 2]>,
+    /// Last result of each ego, and the number of results.
+    results: BTreeMap<CavId, (u64, RemoteEgo)>,
+    /// Time of publication of each tick, by capture time, nanoseconds.
+    ticks: BTreeMap<u64, u64>,
+}
+
+impl Seen {
+    /// Adds a message; one that cannot be decoded says nothing about its sender.
+    fn add(&mut self, topic: &Topic, pieces: &[&[u8]]) {
+        match topic {
+            Topic::Stats(process) => {
+                let Ok((header, stats)) = wire::decode::<Stats>(pieces.iter().copied(), &Limits::DEFAULT) else {
+                    return;
+                };
+                let report = (header.stamp.publish_nanos, stats);
+                self.reports
+                    .entry(process.to_string())
+                    .and_modify(|[_, last]| *last = report.clone())
+                    .or_insert_with(|| [report.clone(), report]);
+            }
+            Topic::Stream { cav, stream: Stream::Detections } => {
+                let decoded = wire::decode::<Detections>(pieces.iter().copied(), &Limits::DEFAULT);
+                let Ok((header, result)) = decoded else { return };
+                let count = self.results.get(cav).map_or(0, |(count, _)| *count) + 1;
+                let began_nanos = self.ticks.get(&header.stamp.capture_nanos);
+                let latency_ms = began_nanos.map(|began| (header.stamp.publish_nanos as f64 - *began as f64) / 1e6);
+                let ego = RemoteEgo { ego: cav.clone(), rate_hz: 0.0, latency_ms, fused: result.fused.len() };
+                self.results.insert(cav.clone(), (count, ego));
+            }
+            Topic::Truth => {
+                if let Ok(header) = wire::decode_header(pieces.iter().copied()) {
+                    self.ticks.insert(header.stamp.capture_nanos, header.stamp.publish_nanos);
+                }
+            }
+            _ => {}
+        }
+    }
+
+    fn status(self, run: String, time: Duration, alive: &BTreeSet<String>) -> RemoteStatus {
+        let observed_s = time.as_secs_f64();
+        let names: BTreeSet<&String> = self.reports.keys().chain(alive).collect();
+        let process = |name: &&String| {
+            let reports = self.reports.get(*name);
+            let last = reports.map(|[_, (_, last)]| last);
+            RemoteProcess {
+                name: (*name).clone(),
+                state: match (alive.contains(*name), last) {
+                    (true, Some(_)) => RemoteState::Alive,
+                    (true, None) => RemoteState::Silent,
+                    (false, _) => RemoteState::Gone,
+                },
+                cores: reports.and_then(cores),
+                resident_mib: last.map(|stats| stats.usage.resident_bytes as f64 / f64::from(1 << 20)),
+                sent: last.map(|stats| stats.ledger.total().sent),
+                dropped: last.map(|stats| stats.ledger.total().dropped_total()),
+            }
+        };
+        let processes = names.iter().map(process).collect();
+        let egos =
+            self.results.into_values().map(|(count, ego)| RemoteEgo { rate_hz: count as f64 / observed_s, ..ego });
+        RemoteStatus { run, observed_s, processes, egos: egos.collect() }
+    }
+}
+
+fn cores([(first_nanos, first), (last_nanos, last)]: &[(u64, Stats); 2]) -> Option<f64> {
+    let seconds = last_nanos.saturating_sub(*first_nanos) as f64 * 1e-9;
+    (seconds > 0.0).then(|| (last.usage.cpu_s - first.usage.cpu_s) / seconds)
+}
+
+#[cfg(test)]
+mod tests {
+    use protocol::{Ledger, ProcessId, ProcessUsage, Stamp};
+
+    use super::*;
+
+    fn stamp(capture_nanos: u64, publish_nanos: u64) -> Stamp {
+        Stamp { cav: CavId::new("1000").unwrap(), epoch: 1, sequence: 0, capture_nanos, publish_nanos }
+    }
+
+    fn report(seen: &mut Seen, name: &str, at_s: f64, cpu_s: f64) {
+        let process: ProcessId = name.parse().unwrap();
+        let usage = ProcessUsage { cpu_s, resident_bytes: 3 << 20, peak_resident_bytes: 3 << 20 };
+        let stats =
+            Stats { process: process.clone(), ledger: Ledger::default(), stages: vec![], usage, traffic: vec![] };
+        let bytes = wire::encode(&stamp(0, (at_s * 1e9) as u64), stats).unwrap().to_vec();
+        seen.add(&Topic::Stats(process), &[&bytes]);
+    }
+
+    #[test]
+    fn processes_are_alive_silent_or_gone() {
+        let mut seen = Seen::default();
+        report(&mut seen, "agent-1000", 1.0, 10.0);
+        report(&mut seen, "agent-1000", 3.0, 11.0);
+        report(&mut seen, "agent-1001", 1.0, 4.0);
+        let alive = BTreeSet::from(["agent-1000".to_owned(), "ego-1000".to_owned()]);
+        let status = seen.status("test".into(), Duration::from_secs(2), &alive);
+        let states: Vec<_> = status.processes.iter().map(|process| (process.name.as_str(), process.state)).collect();
+        let expected =
+            [("agent-1000", RemoteState::Alive), ("agent-1001", RemoteState::Gone), ("ego-1000", RemoteState::Silent)];
+        assert_eq!(states, expected);
+        assert_eq!(status.processes[0].cores, Some(0.5));
+        assert_eq!((status.processes[1].cores, status.processes[1].resident_mib), (None, Some(3.0)));
+        assert_eq!(status.troubles(), ["agent-1001 has left", "ego-1000 is silent"]);
+        assert!(status.table().contains("0.50"), "{}", status.table());
+    }
+
+    #[test]
+    fn nobody_is_a_problem_and_junk_is_none() {
+        let mut seen = Seen::default();
+        seen.add(&Topic::Truth, &[b"junk"]);
+        seen.add(&Topic::Stats("agent-1".parse().unwrap()), &[b"junk"]);
+        let status = seen.status("test".into(), Duration::from_secs(1), &BTreeSet::new());
+        assert_eq!(status.troubles().len(), 1);
+    }
+}
