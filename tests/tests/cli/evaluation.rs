@@ -75,7 +75,7 @@ fn a_script_gives_the_precision_of_the_built_in_method_and_the_files_hold_the_fr
     let metrics: Value = serde_json::from_slice(&slow.stdout).unwrap();
     assert_eq!(metrics["clock"], "stepped");
     // 1.5 MB take 466 ms at 27 Mbit/s: nothing is in time.
-    assert_eq!(metrics["neighbours_fused"].as_f64().unwrap_or(0.0), 0.0, "{metrics}");
+    assert_eq!(metrics["contribution"]["fused_per_frame"].as_f64(), Some(0.0), "{metrics}");
 }
 
 #[test]
