@@ -41,7 +41,8 @@ impl TransformerLayer {
         }
     }
 
-    /// `[B, T, width]` to the same; `mask` is added to the attention, `[B, 1, T, T]`.
+    /// `[B, T, width]` to the same; `mask` is added to the logits of the attention,
+    /// `[B or 1, 1, T, T]`; products are in the precision of `x`, which has to be single with a mask.
     pub(super) fn forward(&self, x: &Tensor, mask: Option<&Tensor>, train: bool) -> Result<Tensor, TchError> {
         let attended = self.attend(&self.before_attention.forward(x)?, mask)?;
         let x = x.f_add(&self.keep_some(attended, train)?)?;
@@ -54,9 +55,18 @@ impl TransformerLayer {
         let (batch, tokens, width) = x.size3()?;
         let parts = dense(&self.qkv, x)?.f_view([batch, tokens, 3, self.heads, width / self.heads])?;
         let parts = parts.f_permute([2, 0, 3, 1, 4])?;
-        let part = |number: i64| parts.f_select(0, number);
-        let found =
-            Tensor::f_scaled_dot_product_attention(&part(0)?, &part(1)?, &part(2)?, mask, 0.0, false, None, false)?;
+        let [query, key, value] = [parts.f_select(0, 0)?, parts.f_select(0, 1)?, parts.f_select(0, 2)?];
+        let found = match mask {
+            None => {
+                let none = None::<Tensor>;
+                Tensor::f_scaled_dot_product_attention(&query, &key, &value, none, 0.0, false, None, false)?
+            }
+            Some(mask) => {
+                let scale = 1.0 / ((width / self.heads) as f64).sqrt();
+                let logits = query.f_matmul(&key.f_transpose(2, 3)?)?.f_mul_scalar(scale)?.f_add(mask)?;
+                logits.f_softmax(3, Kind::Float)?.f_matmul(&value)?
+            }
+        };
         dense(&self.outward, &found.f_transpose(1, 2)?.f_reshape([batch, tokens, width])?)
     }
 

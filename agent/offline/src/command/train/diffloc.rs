@@ -45,26 +45,26 @@ pub(crate) struct Args {
 pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     let config = args.config()?;
     let bar = TrainingBar::of(config.run.length);
-    let (trained, validation) = train_diffloc(&config, &mut |report| show(&bar, report))?;
+    let summary = train_diffloc(&config, &mut |report| show(&bar, report))?;
     bar.finish();
-    print_left_out(&bar, &trained.data);
+    print_left_out(&bar, &summary.trained.data);
     let title = format!("DiffLoc of {}", config.network.scene_name);
     let mut card = ModelCard::new(
         &title,
         "Pose regression by denoising diffusion, trained from random weights on the sweeps of one scene.",
     );
-    card.trained(&config.run, &trained, "all sweeps", "sweeps");
+    card.trained(&config.run, &summary.trained, &format!("{} sweeps", summary.sweeps), "sweeps");
     card.row("augmentation", format_args!("turns up to {} degrees, shifts up to {} m", args.turn, args.shift));
     card.row("mask of static objects", "supervised: pixels in annotated boxes are not static");
-    if let Some(accuracy) = validation {
+    if let Some(accuracy) = summary.validation {
         card.row("validation", text(&accuracy));
     }
-    card.configuration(&config.network);
+    card.configuration(&summary.network);
     card.write(&config.run.out)?;
-    let more = validation.map_or(serde_json::json!({}), |DiffLocAccuracy { p50_m, success_3m }| {
+    let more = summary.validation.map_or(serde_json::json!({}), |DiffLocAccuracy { p50_m, success_3m }| {
         serde_json::json!({"validation": {"p50_m": p50_m, "success_3m": success_3m}})
     });
-    args.options.print(&trained, &more)?;
+    args.options.print(&summary.trained, &more)?;
     Ok(())
 }
 

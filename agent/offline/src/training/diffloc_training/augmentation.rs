@@ -100,7 +100,7 @@ impl Augmentation {
         let code = depth.f_mul_scalar(pixels)?.f_add(&source)?;
         let empty = i64::MAX / 2;
         let least = Tensor::f_full([count, pixels + 1], empty, (Kind::Int64, flat.device()))?
-            .f_scatter_reduce(1, &target, &code, "amin")?
+            .f_internal_scatter_reduce(1, &target, &code, "amin", true)?
             .f_narrow(1, 0, pixels)?;
         let is_filled = least.f_lt(empty)?.f_to_kind(Kind::Float)?.f_unsqueeze(1)?;
         let origin = least.f_remainder(pixels)?.f_unsqueeze(1)?;
@@ -171,4 +171,80 @@ pub(super) fn static_tokens(images: &Tensor, patch: [i64; 2]) -> Result<Tensor, 
     let seen = images.f_narrow(1, 0, 1)?.f_gt(0.0)?.f_to_kind(Kind::Float)?;
     let seen = seen.f_avg_pool2d(patch, patch, [0, 0], false, true, None)?.f_flatten(1, 3)?;
     pooled(CHANNELS as i64)?.f_le_tensor(&(seen * 0.5))?.f_to_kind(Kind::Float)
+}
+
+#[cfg(test)]
+mod tests {
+    use tch::Device;
+
+    use super::*;
+
+    const IMAGE: RangeImageConfig = RangeImageConfig { rows: 8, columns: 64, elevations_deg: [-20.0, 20.0] };
+    const PLAIN: Augmentation = Augmentation { image: IMAGE, turn_columns: 0, shift_m: 0.0 };
+    const METRES: Normalisation = Normalisation { origin_m: [0.0; 3], scale_m: [2.0, 4.0, 1.0] };
+
+    /// Points far enough apart that none hides another.
+    fn cloud() -> Vec<[f32; 4]> {
+        let point = |number: usize| {
+            let (azimuth, range) = (number as f32 * 0.41 + 0.03, 12.0 + number as f32);
+            [range * azimuth.cos(), range * azimuth.sin(), number as f32 % 5.0 - 2.3, 0.5 + number as f32 * 0.01]
+        };
+        (0..15).map(point).collect()
+    }
+
+    /// The sweep of a cloud from a normalised pose; nothing is movable.
+    fn sweep(cloud: &[[f32; 4]], pose: [f32; 5]) -> Augmented {
+        tch::set_num_threads(1);
+        let mut values = IMAGE.image(cloud);
+        values.extend(vec![0.0; IMAGE.pixels()]);
+        let images = Tensor::from_slice(&values).view([1, -1, IMAGE.rows as i64, IMAGE.columns as i64]);
+        Augmented { images, poses: Tensor::from_slice(&pose).view([1, 5]) }
+    }
+
+    fn assert_equal(found: &Augmented, expected: &Augmented) {
+        assert!(found.images.allclose(&expected.images, 1e-4, 1e-4, false));
+        assert!(found.poses.allclose(&expected.poses, 1e-5, 1e-5, false), "{} {}", found.poses, expected.poses);
+        assert!(found.images.select(1, 0).gt(0.0).sum(Kind::Int64).int64_value(&[]) >= 15);
+    }
+
+    #[test]
+    fn rolled_columns_are_the_sweep_of_a_turned_sensor() {
+        let columns = 11;
+        let angle = columns as f32 * std::f32::consts::TAU / IMAGE.columns as f32;
+        let (sin, cos) = angle.sin_cos();
+        let turned: Vec<_> = cloud().iter().map(|&[x, y, z, i]| [x * cos - y * sin, x * sin + y * cos, z, i]).collect();
+        let found = PLAIN.turned(&sweep(&cloud(), [3.0, 4.0, 5.0, 0.0, 1.0]), &Tensor::from_slice(&[columns])).unwrap();
+        // Its points have moved counter-clockwise, so the sensor has turned clockwise: heading 90 degrees less the angle.
+        assert_equal(&found, &sweep(&turned, [3.0, 4.0, 5.0, sin, cos]));
+    }
+
+    #[test]
+    fn moved_pixels_are_the_sweep_of_a_moved_sensor() {
+        let (ahead, left) = (1.5, -0.5);
+        let moved: Vec<_> = cloud().iter().map(|&[x, y, z, i]| [x - ahead, y - left, z, i]).collect();
+        let shift = Tensor::from_slice(&[ahead, left]).view([1, 2]);
+        let found = PLAIN.shifted(&sweep(&cloud(), [3.0, 4.0, 5.0, 0.0, 1.0]), &shift, &METRES).unwrap();
+        // Ahead is north, left is west.
+        assert_equal(&found, &sweep(&moved, [3.0 + 0.5 / 2.0, 4.0 + 1.5 / 4.0, 5.0, 0.0, 1.0]));
+    }
+
+    #[test]
+    fn the_closest_of_the_points_that_move_to_one_pixel_counts() {
+        // On one line of sight only from the new place.
+        let (near, far) = ([6.0, 1.0, 0.1, 0.5], [11.0, 1.0, 0.1, 0.9]);
+        let shift = Tensor::from_slice(&[0.0f32, 0.97]).view([1, 2]);
+        let found = PLAIN.shifted(&sweep(&[near, far], [0.0; 5]), &shift, &METRES).unwrap();
+        let range = found.images.select(1, 0);
+        assert_eq!(range.gt(0.0).sum(Kind::Int64).int64_value(&[]), 1);
+        assert!((range.max().double_value(&[]) * 20.0 - 6.0).abs() < 0.01);
+    }
+
+    #[test]
+    fn a_token_is_static_unless_most_of_its_points_are_movable() {
+        let images = Tensor::zeros([1, 6, 2, 8], (Kind::Float, Device::Cpu));
+        let _ = images.narrow(1, 0, 1).narrow(3, 0, 6).fill_(1.0);
+        let _ = images.narrow(1, 5, 1).narrow(3, 3, 3).fill_(1.0);
+        let statics: Vec<f32> = Vec::try_from(static_tokens(&images, [2, 2]).unwrap().view([-1])).unwrap();
+        assert_eq!(statics, [1.0, 1.0, 0.0, 1.0]);
+    }
 }

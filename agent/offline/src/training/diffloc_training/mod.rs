@@ -71,14 +71,27 @@ pub enum DiffLocReport {
     Validated(f64, DiffLocAccuracy),
 }
 
-/// Trains DiffLoc; writes checkpoint, curve and weights into `config.run.out`. Also the last validation.
+/// Result of a training of DiffLoc.
+#[derive(Debug, Clone)]
+pub struct DiffLocSummary {
+    /// Weights, steps and time.
+    pub trained: Trained,
+    /// Number of sweeps.
+    pub sweeps: usize,
+    /// Configuration as in the weights.
+    pub network: DiffLocConfig,
+    /// The last validation.
+    pub validation: Option<DiffLocAccuracy>,
+}
+
+/// Trains DiffLoc; writes checkpoint, curve and weights into `config.run.out`.
 ///
 /// # Errors
 /// [`LocalizerTrainError`].
 pub fn train_diffloc(
     config: &DiffLocTrainConfig,
     observe: &mut dyn FnMut(&DiffLocReport),
-) -> Result<(Trained, Option<DiffLocAccuracy>), LocalizerTrainError> {
+) -> Result<DiffLocSummary, LocalizerTrainError> {
     let started = Instant::now();
     let run = &config.run;
     run.start()?;
@@ -107,7 +120,12 @@ pub fn train_diffloc(
         (CONFIG_KEY.to_owned(), serde_json::to_string(&network_config).expect("a configuration is JSON")),
         (KIND_KEY.to_owned(), DiffLocLocalizer::KIND.to_owned()),
     ]);
-    Ok((training.trainer.save_weights(&training.variables, about, list.data())?, training.last))
+    Ok(DiffLocSummary {
+        trained: training.trainer.save_weights(&training.variables, about, list.data())?,
+        sweeps: training.images.len() as usize,
+        network: network_config,
+        validation: training.last,
+    })
 }
 
 /// A training in progress.
