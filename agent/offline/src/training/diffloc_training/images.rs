@@ -208,3 +208,56 @@ fn first_of_drive(drives: &[usize], device: Device) -> Result<Tensor, TchError> 
 pub(super) fn columns_of(turn_rad: f32, config: RangeImageConfig) -> i64 {
     (turn_rad / (2.0 * PI) * config.columns as f32).round() as i64
 }
+
+#[cfg(test)]
+mod tests {
+    use dataset::frame::ObjectClass;
+    use protocol::{CavId, Handedness, Pose};
+
+    use super::*;
+
+    #[test]
+    fn pixels_of_annotated_vehicles_are_movable() {
+        // A car 10 m ahead of a sensor that looks north, and across its way; a wall 3 m behind the car.
+        let sensor = Pose::from_xyz_yaw([100.0, 50.0, 2.0], std::f64::consts::FRAC_PI_2);
+        let car = Object {
+            id: 1,
+            class: ObjectClass::Car,
+            world_from_object: Pose::from_xyz_yaw([100.0, 60.0, 0.8], 0.0),
+            size_m: [4.0, 2.0, 1.6],
+            speed_mps: None,
+        };
+        let mut frame = Frame::empty(CavId::new("7").unwrap(), 0, Handedness::Right);
+        frame.objects = vec![car];
+        let points = [[9.0, 1.5, -1.2, 0.5], [9.0, -1.5, -1.2, 0.5], [13.0, 4.0, -1.0, 0.5], [9.0, 2.6, -1.2, 0.5]];
+        let config = RangeImageConfig::default();
+        let image = config.image(&points);
+        let movable = movable_pixels(&frame, &sensor.isometry(), &image, config.pixels());
+        let found = points.map(|[x, y, z, _]| movable[config.pixel([x, y, z]).unwrap().0]);
+        assert_eq!(found, [1.0, 1.0, 0.0, 0.0]);
+        assert_eq!(movable.iter().sum::<f32>(), 2.0);
+    }
+
+    #[test]
+    fn windows_stay_within_a_drive() {
+        let drives = [0, 0, 0, 4, 4];
+        let first: Vec<i64> = Vec::try_from(first_of_drive(&drives, Device::Cpu).unwrap()).unwrap();
+        assert_eq!(first, [0, 0, 0, 3, 3]);
+        let place = |number: usize| Isometry3::translation(number as f64, 0.0, 0.0);
+        let poses: Vec<_> = (0..5).map(place).collect();
+        let normalisation = Normalisation::of(&poses);
+        assert_eq!(normalisation, Normalisation { origin_m: [2.0, 0.0, 0.0], scale_m: [2.0_f64.sqrt(), 1.0, 1.0] });
+        let images = SweepImages {
+            images: Tensor::zeros([5, 1, 1, 1], (Kind::Half, Device::Cpu)),
+            poses: normalisation.normalise(&poses, Device::Cpu).unwrap(),
+            first_of_drive: Tensor::from_slice(&first),
+            normalisation,
+        };
+        let windows = images.draw(200, 3).unwrap().poses.narrow(1, 0, 1) * 2.0_f64.sqrt() + 2.0;
+        let rows: Vec<f32> = Vec::try_from(windows.round().view([-1])).unwrap();
+        for window in rows.chunks_exact(3) {
+            assert!(window.is_sorted() && drives[window[0] as usize] == drives[window[2] as usize], "{window:?}");
+        }
+        assert!(rows.chunks_exact(3).any(|window| window == [0.0, 1.0, 2.0]));
+    }
+}
