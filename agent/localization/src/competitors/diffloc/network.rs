@@ -65,8 +65,8 @@ impl DiffLoc {
         &self.schedule
     }
 
-    /// Normalised poses `[W, F, 5]` (position in deviations from the mean, cosine and sine of the heading) of sweeps with
-    /// features `[W, F, width]`, oldest first; without gradients. The same features give the same poses.
+    /// Normalised poses `[W, F, 5]` (position in deviations from the mean, cosine and sine of the heading) of sweeps
+    /// with features `[W, F, width]`, oldest first; without gradients. The same features give the same poses.
     ///
     /// # Errors
     /// Those of the tensor library.

@@ -25,7 +25,8 @@ pub struct RangeImageConfig {
 }
 
 impl Default for RangeImageConfig {
-    /// 32 x 512; each row holds two of 64 channels from -25 to 2 degrees, the LiDAR of the generated scenes and of OPV2V.
+    /// 32 x 512; each row holds two of 64 channels from -25 to 2 degrees, the LiDAR of the generated scenes and of
+    /// OPV2V.
     fn default() -> Self {
         Self { rows: 32, columns: 512, elevations_deg: [-25.214, 2.214] }
     }

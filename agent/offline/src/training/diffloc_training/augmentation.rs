@@ -1,4 +1,4 @@
-//! Augmentation of range images on the device: the sensor turned and moved, with its pose; noise, lost and hidden pixels.
+//! Augmentation of range images on the device: the sensor turned and moved, with its pose; noise, lost pixels.
 
 use std::f64::consts::TAU;
 
@@ -66,8 +66,8 @@ impl Augmentation {
         Ok(Augmented { images: spoilt(&changed.images)?, poses: changed.poses })
     }
 
-    /// The sweeps of sensors that are moved by `shift_m` `[N, 2]` in their own frames: each pixel moves to where the new
-    /// sensor sees its point, the closest counts.
+    /// The sweeps of sensors that are moved by `shift_m` `[N, 2]` in their own frames: each pixel moves to where the
+    /// new sensor sees its point, the closest counts.
     fn shifted(
         &self,
         sweeps: &Augmented,
@@ -214,7 +214,7 @@ mod tests {
         let (sin, cos) = angle.sin_cos();
         let turned: Vec<_> = cloud().iter().map(|&[x, y, z, i]| [x * cos - y * sin, x * sin + y * cos, z, i]).collect();
         let found = PLAIN.turned(&sweep(&cloud(), [3.0, 4.0, 5.0, 0.0, 1.0]), &Tensor::from_slice(&[columns])).unwrap();
-        // Its points have moved counter-clockwise, so the sensor has turned clockwise: heading 90 degrees less the angle.
+        // Its points have moved counter-clockwise, so the sensor has turned clockwise: heading 90 degrees less.
         assert_equal(&found, &sweep(&turned, [3.0, 4.0, 5.0, sin, cos]));
     }
 
