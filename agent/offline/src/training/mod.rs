@@ -2,6 +2,7 @@
 //! only a head on the frozen encoder's features.
 
 mod contrast;
+mod diffloc_training;
 mod encoder_training;
 mod end_to_end_training;
 mod error;
@@ -14,6 +15,7 @@ mod scene_validation;
 mod sweep_store;
 mod turned_sweep;
 
+pub use diffloc_training::{DiffLocAccuracy, DiffLocReport, DiffLocSummary, DiffLocTrainConfig, train_diffloc};
 pub use encoder_training::{EncoderAccuracy, EncoderReport, EncoderSummary, EncoderTrainConfig, train_encoder};
 pub use end_to_end_training::{EncoderStart, EndToEndReport, EndToEndTrainConfig, train_end_to_end};
 pub use error::LocalizerTrainError;

@@ -1,5 +1,6 @@
 //! `agent train`: the two stages of a localizer.
 
+mod diffloc;
 mod encoder;
 mod end_to_end;
 pub(super) mod options;
@@ -21,6 +22,8 @@ enum Stage {
     Encoder(encoder::Args),
     Scene(scene::Args),
     EndToEnd(end_to_end::Args),
+    #[command(name = "diffloc")]
+    DiffLoc(diffloc::Args),
 }
 
 /// Runs the chosen stage.
@@ -30,5 +33,6 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         Stage::Encoder(args) => encoder::run(args),
         Stage::Scene(args) => scene::run(args),
         Stage::EndToEnd(args) => end_to_end::run(args),
+        Stage::DiffLoc(args) => diffloc::run(args),
     }
 }
