@@ -2,11 +2,15 @@
 
 mod end_to_end;
 mod end_to_end_localizer;
+pub mod hypliloc;
 mod lightloc;
+mod open;
 mod retrieval;
 mod sgloc_head;
 
 pub use end_to_end::{EndToEnd, EndToEndConfig, EndToEndKind};
 pub use end_to_end_localizer::EndToEndLocalizer;
+pub use hypliloc::HypLiLocLocalizer;
 pub use lightloc::LightLoc;
+pub use open::open_end_to_end;
 pub use retrieval::{DescribedSweep, Retrieval, SweepDatabase};

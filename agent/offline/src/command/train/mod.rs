@@ -2,6 +2,7 @@
 
 mod encoder;
 mod end_to_end;
+mod hypliloc;
 pub(super) mod options;
 mod scene;
 
@@ -21,6 +22,8 @@ enum Stage {
     Encoder(encoder::Args),
     Scene(scene::Args),
     EndToEnd(end_to_end::Args),
+    #[command(name = "hypliloc")]
+    HypLiLoc(hypliloc::Args),
 }
 
 /// Runs the chosen stage.
@@ -30,5 +33,6 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         Stage::Encoder(args) => encoder::run(args),
         Stage::Scene(args) => scene::run(args),
         Stage::EndToEnd(args) => end_to_end::run(args),
+        Stage::HypLiLoc(args) => hypliloc::run(args),
     }
 }

@@ -1,0 +1,86 @@
+//! Rows through a dense layer, a norm and a ReLU.
+
+use perception::layers::convolution::Norm;
+use tch::nn::{self, LayerNormConfig, Module};
+use tch::{TchError, Tensor};
+
+use crate::pgc::dense::Dense;
+
+/// Epsilon and momentum of the batch norms, PyTorch's own.
+const NORM: (f64, f64) = (1e-5, 0.1);
+
+/// Dense layer with batch norm and ReLU, of points.
+#[derive(Debug)]
+pub(super) struct BatchNormed {
+    dense: Dense,
+    norm: Norm,
+}
+
+impl BatchNormed {
+    /// Builds a chain of layers of these channels below `path`.
+    pub(super) fn chain(path: &nn::Path<'_>, channels: &[i64]) -> Vec<Self> {
+        let layer = |(number, io): (usize, &[i64])| {
+            let path = path / number;
+            Self {
+                dense: Dense::new(&path, io[0], io[1], 1.0),
+                norm: Norm::with_eps(&(&path / "norm"), io[1], NORM.0, NORM.1),
+            }
+        };
+        channels.windows(2).enumerate().map(layer).collect()
+    }
+
+    /// `[N, C]` to `[N, C']`, in the precision of `x`.
+    ///
+    /// # Errors
+    /// Those of the tensor library.
+    pub(super) fn forward(&self, x: &Tensor, train: bool) -> Result<Tensor, TchError> {
+        self.norm.forward(&self.dense.forward(x)?, train).f_relu()
+    }
+}
+
+/// Layer norm and ReLU after tokens.
+#[derive(Debug)]
+pub(super) struct TokenNorm(nn::LayerNorm);
+
+impl TokenNorm {
+    /// The identity, before it is trained, of normalised tokens.
+    pub(super) fn new(path: &nn::Path<'_>, channels: i64) -> Self {
+        Self(nn::layer_norm(path, vec![channels], LayerNormConfig::default()))
+    }
+
+    /// `[.., C]` in single precision.
+    pub(super) fn forward(&self, x: &Tensor) -> Result<Tensor, TchError> {
+        self.0.forward(x).f_relu()
+    }
+}
+
+/// Dense layer, layer norm and ReLU, of tokens.
+#[derive(Debug)]
+pub(super) struct LayerNormed {
+    dense: Dense,
+    norm: TokenNorm,
+}
+
+impl LayerNormed {
+    /// Builds a layer that keeps the number of channels.
+    pub(super) fn new(path: &nn::Path<'_>, channels: i64) -> Self {
+        Self { dense: Dense::new(path, channels, channels, 1.0), norm: TokenNorm::new(&(path / "norm"), channels) }
+    }
+
+    /// `[S, T, C]` in single precision.
+    ///
+    /// # Errors
+    /// Those of the tensor library.
+    pub(super) fn forward(&self, tokens: &Tensor) -> Result<Tensor, TchError> {
+        self.norm.forward(&of_tokens(&self.dense, tokens)?)
+    }
+}
+
+/// A dense layer of tokens `[S, T, C]`.
+///
+/// # Errors
+/// Those of the tensor library.
+pub(super) fn of_tokens(dense: &Dense, tokens: &Tensor) -> Result<Tensor, TchError> {
+    let (sweeps, count, channels) = tokens.size3()?;
+    dense.forward(&tokens.f_reshape([-1, channels])?)?.f_view([sweeps, count, -1])
+}
