@@ -1,30 +1,25 @@
 //! Rows through a dense layer, a norm and a ReLU.
 
-use perception::layers::convolution::Norm;
-use tch::nn::{self, LayerNormConfig, Module};
+use tch::nn::{self, BatchNormConfig, Init, LayerNormConfig, Module, ModuleT};
 use tch::{TchError, Tensor};
 
 use crate::pgc::dense::Dense;
-
-/// Epsilon and momentum of the batch norms, PyTorch's own.
-const NORM: (f64, f64) = (1e-5, 0.1);
 
 /// Dense layer with batch norm and ReLU, of points.
 #[derive(Debug)]
 pub(super) struct BatchNormed {
     dense: Dense,
-    norm: Norm,
+    norm: nn::BatchNorm,
 }
 
 impl BatchNormed {
     /// Builds a chain of layers of these channels below `path`.
     pub(super) fn chain(path: &nn::Path<'_>, channels: &[i64]) -> Vec<Self> {
+        // Not by cuDNN, which is slow on a million rows of few channels.
+        let config = BatchNormConfig { ws_init: Init::Const(1.0), cudnn_enabled: false, ..BatchNormConfig::default() };
         let layer = |(number, io): (usize, &[i64])| {
             let path = path / number;
-            Self {
-                dense: Dense::new(&path, io[0], io[1], 1.0),
-                norm: Norm::with_eps(&(&path / "norm"), io[1], NORM.0, NORM.1),
-            }
+            Self { dense: Dense::new(&path, io[0], io[1], 1.0), norm: nn::batch_norm1d(&path / "norm", io[1], config) }
         };
         channels.windows(2).enumerate().map(layer).collect()
     }
@@ -34,7 +29,7 @@ impl BatchNormed {
     /// # Errors
     /// Those of the tensor library.
     pub(super) fn forward(&self, x: &Tensor, train: bool) -> Result<Tensor, TchError> {
-        self.norm.forward(&self.dense.forward(x)?, train).f_relu()
+        self.norm.forward_t(&self.dense.forward(x)?, train).f_relu()
     }
 }
 

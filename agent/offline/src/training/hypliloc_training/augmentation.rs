@@ -46,3 +46,50 @@ fn turned(vectors: &Tensor, angles_rad: &Tensor) -> Result<Tensor, TchError> {
     }
     Tensor::f_stack(&all, -1)
 }
+
+#[cfg(test)]
+mod tests {
+    use tch::Device;
+
+    use super::*;
+    use localization::competitors::hypliloc::SweepInput;
+
+    /// A wall of 20 degrees at 40 m, to the front left of the sensor.
+    fn wall() -> Vec<[f32; 3]> {
+        let point = |k: i32| {
+            let azimuth = (30.0 + 0.02 * (k % 1000) as f32).to_radians();
+            [40.0 * azimuth.cos(), 40.0 * azimuth.sin(), -1.0 - (k / 1000) as f32]
+        };
+        (0..8000).map(point).collect()
+    }
+
+    fn azimuth_deg(x: f64, y: f64) -> f64 {
+        y.atan2(x).to_degrees()
+    }
+
+    #[test]
+    fn what_a_sweep_shows_stays_where_it_is_in_the_world() {
+        tch::set_num_threads(1);
+        tch::manual_seed(5);
+        let input = SweepInput::new(&wall()).unwrap();
+        let heading = Tensor::from_slice(&[0.0f32, 1.0]).view([1, 2]);
+        for _ in 0..8 {
+            let batch = InputBatch::new(std::slice::from_ref(&input), Device::Cpu).unwrap();
+            let truth = Truth { position: Tensor::from_slice(&[1f32, 2.0, 3.0]).view([1, 3]), heading: heading.copy() };
+            let (batch, truth) = augment((batch, truth)).unwrap();
+            let pair = |of: &Tensor| azimuth_deg(of.double_value(&[0]), of.double_value(&[1]));
+            let heading_deg = pair(&truth.heading.view([2]));
+            // The wall's middle: 40 degrees to the left of a vehicle that heads north.
+            let off = |azimuth_deg: f64| (azimuth_deg + heading_deg - 130.0 + 540.0).rem_euclid(360.0) - 180.0;
+            let middle = batch.points_m.mean_dim(1_i64, false, Kind::Float).view([3]);
+            assert!(off(pair(&middle)).abs() < 1.5, "{} {heading_deg}", pair(&middle));
+            let seen = batch.ranges_m.gt(0.0).nonzero().narrow(1, 2, 1).to_kind(Kind::Float);
+            let turn = (seen + 0.5) * (TAU / COLUMNS as f64) - TAU / 2.0;
+            let sum = |of: Tensor| of.sum(Kind::Float).double_value(&[]);
+            let image_deg = azimuth_deg(sum(turn.cos()), sum(turn.sin()));
+            assert!(off(image_deg).abs() < 1.5, "{image_deg} {heading_deg}");
+            let kept: Vec<f32> = Vec::try_from(&truth.position.view([3])).unwrap();
+            assert_eq!(kept, [1.0, 2.0, 3.0]);
+        }
+    }
+}

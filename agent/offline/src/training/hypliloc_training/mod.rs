@@ -108,3 +108,48 @@ pub fn train_hypliloc(
     ]);
     Ok(trainer.save_weights(&variables, about, examples.data)?)
 }
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use localization::competitors::open_end_to_end;
+    use localization::pgc::pose_solver::PoseSolver;
+    use perception::train::Length;
+    use protocol::PointCloud;
+    use simulator::generate::{Subset, SynthOptions, generate};
+    use tch::Device;
+
+    use super::*;
+
+    fn config(scene: &Path, out: &Path, steps: u64) -> HypLiLocTrainConfig {
+        let run = RunConfig { batch: 2, ..RunConfig::new(Length::Steps(steps), out) };
+        HypLiLocTrainConfig { scenes: vec![scene.to_owned()], scene_name: "small".into(), run }
+    }
+
+    #[test]
+    fn a_training_is_resumed_and_its_weights_are_opened_by_their_kind() {
+        tch::set_num_threads(1);
+        let folder = tempfile::tempdir().unwrap();
+        let (scene, out) = (folder.path().join("scene"), folder.path().join("out"));
+        let drive = SynthOptions { frames: 2, ..SynthOptions::new(Subset::Town1loc, 400, scene.clone()) };
+        generate(&drive, &|_| ()).unwrap();
+        let mut sampled = 0;
+        let mut observe = |report: &HypLiLocReport| {
+            if let HypLiLocReport::Sampling(done, _) = report {
+                sampled = *done;
+            }
+        };
+        assert_eq!(train_hypliloc(&config(&scene, &out, 2), &mut observe).unwrap().steps, 2);
+        assert!(sampled >= 2, "{sampled}");
+        let mut resumed = config(&scene, &out, 3);
+        resumed.run.resume = true;
+        let trained = train_hypliloc(&resumed, &mut |_| ()).unwrap();
+        assert_eq!(trained.steps, 3);
+        assert!(trained.weights.metadata().unwrap().len() < 10_000_000);
+        let mut localizer = open_end_to_end(&trained.weights, Device::Cpu, PoseSolver::default()).unwrap();
+        let wall = (0..4000).map(|k| [(k % 60) as f32 - 30.0, 9.0, (k / 60) as f32 * 0.1, 0.2]);
+        let answer = localizer.localize(&PointCloud { xyzi: wall.collect() }).unwrap();
+        assert!(answer.estimate.world_from_cav().is_some(), "{answer:?}");
+    }
+}
