@@ -7,6 +7,7 @@ use tch::Device;
 
 use super::diffloc::DiffLocLocalizer;
 use super::end_to_end_localizer::EndToEndLocalizer;
+use super::hypliloc::HypLiLocLocalizer;
 use crate::pgc::pose_solver::PoseSolver;
 use crate::pgc::{Localize, LocalizerError};
 
@@ -18,6 +19,7 @@ use crate::pgc::{Localize, LocalizerError};
 pub fn load_competitor(path: &Path, device: Device, solver: PoseSolver) -> Result<Box<dyn Localize>, LocalizerError> {
     match Weights::load(path)?.metadata(KIND_KEY) {
         Some(DiffLocLocalizer::KIND) => Ok(Box::new(DiffLocLocalizer::load(path, device)?)),
+        Some(HypLiLocLocalizer::KIND) => Ok(Box::new(HypLiLocLocalizer::load(path, device)?)),
         _ => {
             let mut localizer = EndToEndLocalizer::load(path, device)?;
             localizer.set_solver(solver);

@@ -52,7 +52,7 @@ pub(crate) struct Args {
         default_value = "deploy/weights/pgc-town1.safetensors"
     )]
     head: Vec<SceneHeadFile>,
-    /// Weights of a competitor (`agent train end-to-end`, `diffloc`), instead of encoder and head.
+    /// Weights of a competitor (`agent train end-to-end`, `diffloc`, `hypliloc`), instead of encoder and head.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["encoder", "head", "fit_confidence"])]
     end_to_end: Option<PathBuf>,
     /// Leave out what PGC adds to LightLoc: predicted error, refinement and confidence.

@@ -7,6 +7,7 @@ mod encoder_training;
 mod end_to_end_training;
 mod error;
 mod feature_cache;
+mod hypliloc_training;
 mod kmeans;
 mod pairs;
 mod redundancy;
@@ -21,6 +22,7 @@ pub use end_to_end_training::{EncoderStart, EndToEndReport, EndToEndTrainConfig,
 pub use error::LocalizerTrainError;
 pub(crate) use feature_cache::FeatureCache;
 pub use feature_cache::SweepAugmentation;
+pub use hypliloc_training::{HypLiLocReport, HypLiLocTrainConfig, train_hypliloc};
 pub(crate) use kmeans::kmeans;
 pub use pairs::Pair;
 pub(crate) use redundancy::Redundancy;

@@ -3,6 +3,7 @@
 mod diffloc;
 mod encoder;
 mod end_to_end;
+mod hypliloc;
 pub(super) mod options;
 mod scene;
 
@@ -24,6 +25,8 @@ enum Stage {
     EndToEnd(end_to_end::Args),
     #[command(name = "diffloc")]
     DiffLoc(diffloc::Args),
+    #[command(name = "hypliloc")]
+    HypLiLoc(hypliloc::Args),
 }
 
 /// Runs the chosen stage.
@@ -34,5 +37,6 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         Stage::Scene(args) => scene::run(args),
         Stage::EndToEnd(args) => end_to_end::run(args),
         Stage::DiffLoc(args) => diffloc::run(args),
+        Stage::HypLiLoc(args) => hypliloc::run(args),
     }
 }
