@@ -8,6 +8,7 @@ use std::process::ExitCode;
 
 use clap::Parser;
 use support::cli::exit_code;
+use support::command_line::parse;
 
 /// Collaborative perception without GNSS as a distributed system: run, evaluate and view it.
 #[derive(Debug, Parser)]
@@ -24,6 +25,7 @@ struct CommandLine {
 }
 
 fn main() -> ExitCode {
+    let command_line: CommandLine = parse();
     bus::log_to_stderr();
-    exit_code(CommandLine::parse().command.run(), command::is_bad_input)
+    exit_code(command_line.command.run(), command::is_bad_input)
 }

@@ -7,8 +7,6 @@ mod command_line;
 
 use std::process::ExitCode;
 
-use clap::Parser;
-
 fn main() -> ExitCode {
-    command_line::run(command_line::Cli::parse())
+    command_line::run(support::command_line::parse())
 }

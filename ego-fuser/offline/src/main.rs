@@ -8,6 +8,7 @@ use std::process::ExitCode;
 
 use clap::Parser;
 use support::cli::exit_code;
+use support::command_line::parse;
 
 /// Training and evaluation of collaborative detection.
 #[derive(Debug, Parser)]
@@ -18,5 +19,5 @@ struct CommandLine {
 }
 
 fn main() -> ExitCode {
-    exit_code(CommandLine::parse().command.run(), |_| false)
+    exit_code(parse::<CommandLine>().command.run(), |_| false)
 }

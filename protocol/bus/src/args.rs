@@ -9,6 +9,7 @@ use protocol::config::{FieldError, above_zero, within};
 use protocol::{CavId, Role, RunId};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use support::output::{Verbosity, verbosity};
 use tracing_subscriber::layer::{Layer, SubscriberExt};
 use tracing_subscriber::util::SubscriberInitExt;
 use tracing_subscriber::{EnvFilter, Registry};
@@ -190,15 +191,26 @@ impl InboxConfig {
     }
 }
 
-/// Writes the log to standard error: warnings, and messages of this program's own crates at `info` and above, unless
-/// `RUST_LOG` sets another filter. Failed handshakes are counted ([`super::RejectionLog`]) and not logged one by one.
+/// Writes the log to standard error: warnings, and messages of this program's own crates at `info` and above, or what
+/// `-v` or `-q` asked for, unless `RUST_LOG` sets another filter. Failed handshakes are counted ([`super::RejectionLog`]) and not logged one by one.
 pub fn log_to_stderr() {
-    const OURS: &str = "warn,zenoh_link_commons::quic=error,\
-                        protocol=info,sim_replay=info,agent=info,ego_fuser=info,deploy=info";
-    let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(OURS));
+    let ours = match verbosity() {
+        Verbosity::Quiet => "error".to_owned(),
+        Verbosity::Usual => ours_at("info"),
+        Verbosity::Debug => ours_at("debug") + ",bus=debug",
+        Verbosity::Trace => ours_at("trace") + ",bus=trace",
+    };
+    let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(ours));
     // Colours are for terminals: a supervisor redirects the log into a file.
     let to_stderr =
         tracing_subscriber::fmt::layer().with_writer(std::io::stderr).with_ansi(std::io::stderr().is_terminal());
     // A second call, in tests, changes nothing.
     let _ = Registry::default().with(to_stderr.with_filter(filter)).with(HandshakeCounter).try_init();
+}
+
+/// Filter with the project's own crates at a level.
+fn ours_at(level: &str) -> String {
+    let crates = ["protocol", "sim_replay", "agent", "ego_fuser", "deploy"];
+    let ours: String = crates.iter().map(|name| format!(",{name}={level}")).collect();
+    format!("warn,zenoh_link_commons::quic=error{ours}")
 }

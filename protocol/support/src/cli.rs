@@ -38,7 +38,7 @@ impl Outcome {
     /// Prints an error of the input.
     #[must_use]
     pub fn bad_input(error: &dyn Display) -> Self {
-        output::note(format_args!("error: {error}"));
+        output::error(error);
         Self::BadInput
     }
 
@@ -57,7 +57,7 @@ pub fn exit_code(result: anyhow::Result<Outcome>, is_bad_input: impl Fn(&(dyn Er
         Ok(Outcome::BadInput) => ExitCode::from(2),
         Ok(Outcome::DataLost) => ExitCode::from(3),
         Err(error) => {
-            output::note(format_args!("error: {}", chain_of(&error)));
+            output::error(chain_of(&error));
             let is_bad = error.chain().any(|cause| cause.is::<BadInput>() || is_bad_input(cause));
             if is_bad { ExitCode::from(2) } else { ExitCode::FAILURE }
         }

@@ -1,6 +1,6 @@
 //! Program support: common functions of all programs that no crate of the field offers.
 //!
-//! - [`cli`]: errors and exit codes; [`sibling_program`]: subcommands that another program executes; [`shared_files`]: files
+//! - [`command_line`]: parsing, verbosity, completions; [`cli`]: errors and exit codes; [`sibling_program`]: subcommands that another program executes; [`shared_files`]: files
 //!   that come with the programs.
 //! - [`output`], [`progress`], [`text_table`]: standard output and error, progress bars, tables.
 //! - [`bounded_file`], [`atomic_file`], [`csv_file`]: reads with a limit on their size, atomic writes, CSV.
@@ -24,6 +24,7 @@
 pub mod atomic_file;
 pub mod bounded_file;
 pub mod cli;
+pub mod command_line;
 pub mod csv_file;
 pub mod nanos;
 pub mod output;

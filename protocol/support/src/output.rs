@@ -5,6 +5,35 @@
 
 use std::fmt::Display;
 use std::io::{self, ErrorKind, Write};
+use std::sync::atomic::{AtomicU8, Ordering};
+
+/// How much a program says on standard error.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Verbosity {
+    /// Errors only.
+    Quiet,
+    /// Notes, progress and warnings.
+    Usual,
+    /// The log of the project's own crates at `debug` too.
+    Debug,
+    /// The same at `trace`.
+    Trace,
+}
+
+static VERBOSITY: AtomicU8 = AtomicU8::new(Verbosity::Usual as u8);
+
+/// Sets the verbosity of this process.
+pub fn set_verbosity(verbosity: Verbosity) {
+    VERBOSITY.store(verbosity as u8, Ordering::Relaxed);
+}
+
+/// The verbosity of this process.
+#[must_use]
+pub fn verbosity() -> Verbosity {
+    let set = VERBOSITY.load(Ordering::Relaxed);
+    let all = [Verbosity::Quiet, Verbosity::Usual, Verbosity::Debug, Verbosity::Trace];
+    all.into_iter().find(|verbosity| *verbosity as u8 == set).unwrap_or(Verbosity::Usual)
+}
 
 /// Prints a line to standard output.
 ///
@@ -22,8 +51,16 @@ pub fn text(text: impl Display) -> io::Result<()> {
     print(io::stdout().lock(), text)
 }
 
-/// Prints a line to standard error. A failure cannot be reported and is ignored.
+/// Prints a line to standard error, unless that is quiet. A failure cannot be reported and is ignored.
 pub fn note(line: impl Display) {
+    if verbosity() > Verbosity::Quiet {
+        let _ = print(io::stderr().lock(), format_args!("{line}\n"));
+    }
+}
+
+/// Prints an error to standard error, also where that is quiet.
+pub fn error(line: impl Display) {
+    let line = format_args!("error: {line}");
     let _ = print(io::stderr().lock(), format_args!("{line}\n"));
 }
 

@@ -4,6 +4,8 @@ use std::io::{IsTerminal, stderr};
 
 use indicatif::{ProgressBar, ProgressStyle};
 
+use crate::output::{Verbosity, verbosity};
+
 /// A bar over `total` steps with the name `unit`, for example `frames`; its message, if any, is behind it.
 #[must_use]
 pub fn bar(total: usize, unit: &str) -> ProgressBar {
@@ -27,7 +29,7 @@ fn with_template(total: usize, template: &str) -> ProgressBar {
 }
 
 fn styled(bar: ProgressBar, template: &str) -> ProgressBar {
-    if !stderr().is_terminal() {
+    if !stderr().is_terminal() || verbosity() == Verbosity::Quiet {
         return ProgressBar::hidden();
     }
     match ProgressStyle::with_template(template) {

@@ -9,6 +9,8 @@ use std::io;
 use std::os::unix::process::CommandExt;
 use std::process::Command;
 
+use crate::output::{Verbosity, verbosity};
+
 /// Arguments of a subcommand that a sibling program executes, `--help` included.
 #[derive(Debug, clap::Args)]
 #[command(disable_help_flag = true)]
@@ -24,7 +26,13 @@ impl Forwarded {
     pub fn exec(&self, program: &str, subcommand: &str) -> io::Error {
         let beside = env::current_exe().ok().map(|own| own.with_file_name(program)).filter(|path| path.exists());
         let path = beside.unwrap_or_else(|| program.into());
-        let error = Command::new(&path).arg(subcommand).args(&self.arguments).exec();
+        let verbosity: &[&str] = match verbosity() {
+            Verbosity::Quiet => &["--quiet"],
+            Verbosity::Usual => &[],
+            Verbosity::Debug => &["-v"],
+            Verbosity::Trace => &["-vv"],
+        };
+        let error = Command::new(&path).args(verbosity).arg(subcommand).args(&self.arguments).exec();
         io::Error::new(error.kind(), format!("{subcommand} is part of the program {}: {error}", path.display()))
     }
 }

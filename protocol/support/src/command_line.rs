@@ -1,0 +1,110 @@
+//! Command line: parsing with the options of all programs, shell completions and manual pages.
+
+use std::env;
+use std::io;
+use std::path::Path;
+use std::process;
+
+use clap::{Arg, ArgAction, Command, CommandFactory, FromArgMatches, Parser};
+use clap_complete::Shell;
+
+use crate::output::{self, Verbosity};
+
+/// Variable that asks for a completion script (`bash`, `zsh`, `fish`, ...) on standard output, or for manual pages in a
+/// folder (`man:FOLDER`), instead of running.
+const GENERATE: &str = "V2VLOC_GENERATE";
+
+/// Parses the command line of this process; sets the verbosity of its messages. Ends the process on wrong usage, as
+/// [`Parser::parse`].
+#[must_use]
+pub fn parse<P: Parser>() -> P {
+    let command = with_verbosity(P::command());
+    if let Some(wanted) = env::var_os(GENERATE) {
+        let wanted = wanted.to_string_lossy();
+        let generated = generate(command, &wanted);
+        if let Err(error) = &generated {
+            output::error(format_args!("{GENERATE}={wanted}: {error}"));
+        }
+        process::exit(if generated.is_ok() { 0 } else { 2 });
+    }
+    let matches = command.get_matches();
+    output::set_verbosity(verbosity(matches.get_count("verbose"), matches.get_flag("quiet")));
+    P::from_arg_matches(&matches).unwrap_or_else(|error| error.exit())
+}
+
+/// The options that set how much is said on standard error.
+fn with_verbosity(command: Command) -> Command {
+    let verbose = Arg::new("verbose").short('v').long("verbose").action(ArgAction::Count).global(true);
+    let quiet = Arg::new("quiet").short('q').long("quiet").action(ArgAction::SetTrue).global(true);
+    command
+        .arg(verbose.help("Log more, -vv even more; RUST_LOG sets single parts").conflicts_with("quiet"))
+        .arg(quiet.help("Errors only on standard error: no progress, notes and warnings"))
+}
+
+fn verbosity(verbose: u8, quiet: bool) -> Verbosity {
+    match (quiet, verbose) {
+        (true, _) => Verbosity::Quiet,
+        (false, 0) => Verbosity::Usual,
+        (false, 1) => Verbosity::Debug,
+        (false, _) => Verbosity::Trace,
+    }
+}
+
+fn generate(mut command: Command, wanted: &str) -> io::Result<()> {
+    if let Some(folder) = wanted.strip_prefix("man:") {
+        return clap_mangen::generate_to(command, Path::new(folder));
+    }
+    let shell: Shell = wanted.parse().map_err(|error: String| io::Error::new(io::ErrorKind::InvalidInput, error))?;
+    let name = command.get_name().to_owned();
+    let mut script = Vec::new();
+    clap_complete::generate(shell, &mut command, name, &mut script);
+    output::text(String::from_utf8_lossy(&script))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[derive(Debug, Parser)]
+    #[command(name = "program")]
+    struct Cli {
+        #[command(subcommand)]
+        command: Sub,
+    }
+
+    #[derive(Debug, clap::Subcommand)]
+    enum Sub {
+        /// Does it.
+        Act {
+            #[arg(long)]
+            fast: bool,
+        },
+    }
+
+    #[test]
+    fn verbosity_is_known_to_every_subcommand() {
+        let of = |line: &str| with_verbosity(Cli::command()).try_get_matches_from(line.split(' '));
+        for (line, expected) in [
+            ("program act --fast", Verbosity::Usual),
+            ("program -v act", Verbosity::Debug),
+            ("program act -vv", Verbosity::Trace),
+            ("program act --quiet", Verbosity::Quiet),
+        ] {
+            let matches = of(line).unwrap();
+            assert_eq!(verbosity(matches.get_count("verbose"), matches.get_flag("quiet")), expected, "{line}");
+            let Sub::Act { fast } = Cli::from_arg_matches(&matches).unwrap().command;
+            assert_eq!(fast, line.contains("--fast"));
+        }
+        assert!(of("program act -v -q").is_err());
+    }
+
+    #[test]
+    fn manual_pages_are_written_and_an_unknown_shell_is_named() {
+        let folder = tempfile::tempdir().unwrap();
+        generate(with_verbosity(Cli::command()), &format!("man:{}", folder.path().display())).unwrap();
+        let mut pages: Vec<_> = folder.path().read_dir().unwrap().map(|page| page.unwrap().file_name()).collect();
+        pages.sort();
+        assert!(pages.contains(&"program.1".into()) && pages.contains(&"program-act.1".into()), "{pages:?}");
+        assert!(generate(Cli::command(), "tcsh").is_err());
+    }
+}
