@@ -1,6 +1,6 @@
 //! Average precision and hits of a scorer.
 
-use training::average_precision::{Ordering, Scorer};
+use dataset::average_precision::{Ordering, Scorer};
 
 use crate::score::metrics::ByIou;
 
