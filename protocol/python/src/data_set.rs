@@ -23,7 +23,7 @@ pub(crate) struct DataSet {
 
 enum Source {
     Folder(Dataset),
-    Recording(RecordingFrames),
+    Recording(Box<RecordingFrames>),
 }
 
 impl DataSet {
@@ -152,7 +152,7 @@ pub(crate) fn read(py: Python<'_>, path: PathBuf, points: bool, radar: bool, cam
         Some(file) => {
             let protocol = protocol(Layout::RECORDING)?;
             let recording = RecordingFrames::open(&file, &options, protocol.clone()).map_err(error)?;
-            Ok((Source::Recording(recording), protocol))
+            Ok((Source::Recording(Box::new(recording)), protocol))
         }
         None => {
             let dataset = dataset::open(&path).map_err(error)?;

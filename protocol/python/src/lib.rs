@@ -15,6 +15,7 @@ mod listener;
 mod live_frames;
 mod payload;
 mod recording_frames;
+mod subscriptions;
 
 use pyo3::pymodule;
 

@@ -1,12 +1,13 @@
 //! Listener: follows a live run as a passive subscriber and hands over its frames, or its messages.
 
 use std::path::PathBuf;
+use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
 use bus::bounded_queue::Pop;
-use bus::{Bus, BusOptions, Credentials, Endpoint, Identity, PassiveSubscriber, RawMessage, process_id};
+use bus::{Bus, BusOptions, Credentials, Endpoint, Identity, PassiveSubscriber, RawMessage};
 use dataset::evaluation_protocol::EvaluationProtocol;
-use protocol::{CavId, KeyExpr, Principal, Role, RunId, Stream, Topic, Verb};
+use protocol::{CavId, Principal, Role, RunId, Topic, Verb};
 use pyo3::types::{PyDict, PyDictMethods};
 use pyo3::{Bound, Py, PyAny, PyRef, PyRefMut, PyResult, Python, pyclass, pyfunction, pymethods};
 
@@ -15,6 +16,7 @@ use crate::error::error;
 use crate::frame::Frame;
 use crate::frame_parts::is_part_of_frames;
 use crate::live_frames::LiveFrames;
+use crate::subscriptions::{self, Access};
 
 /// Interval between two checks for Ctrl-C.
 const POLL: Duration = Duration::from_millis(50);
@@ -26,10 +28,6 @@ const CLOSE_LIMIT: Duration = Duration::from_secs(2);
 const PLACES: usize = 64;
 /// Messages that cannot be decoded and are named; all are counted.
 const MOST_NAMED: usize = 100;
-
-/// Streams without a choice: all but the largest, which agents and viewers need not share.
-const STREAMS: [Stream; 7] =
-    [Stream::Gnss, Stream::Imu, Stream::Pose, Stream::Bev, Stream::Boxes, Stream::Points, Stream::Detections];
 
 /// Frames of a live run as they arrive.
 #[pyclass(module = "v2vloc")]
@@ -252,16 +250,17 @@ pub(crate) fn listen(
     let endpoint = Endpoint::new(endpoint).map_err(error)?;
     let timeout = timeout_s.map(|seconds| seconds_of("timeout_s", seconds)).transpose()?;
     let settle = seconds_of("settle_s", settle_s)?;
-    let selectors = selectors(&run, streams)?;
     let mut options = BusOptions::client(endpoint.clone());
     options.connect_timeout = timeout.unwrap_or(CONNECT_LIMIT).min(CONNECT_LIMIT);
-    let mut identity = anonymous(&run)?;
+    let (mut principal, mut access) = (anonymous()?, Access::All);
     if let Some(folder) = credentials {
         let credentials = Credentials::read(&folder).map_err(error)?;
-        let Principal { role, cav } = credentials.name().parse().map_err(error)?;
-        identity = Identity { run: run.clone(), process: process_id(role, &cav), cav };
+        principal = credentials.name().parse().map_err(error)?;
+        access = Access::of(&principal, &run);
         options = options.with_credentials(credentials);
     }
+    let selectors = subscriptions::selectors(&run, streams, &access)?;
+    let identity = Identity { run: run.clone(), process: principal.name(), cav: principal.cav };
     let connect = || {
         let bus = Bus::join(&options, identity)?;
         let subscriber = bus.tap(&selectors, PLACES)?;
@@ -288,32 +287,10 @@ fn seconds_of(name: &str, seconds: f64) -> PyResult<Duration> {
     Duration::try_from_secs_f64(seconds).map_err(|cause| error(format!("{name}: {seconds}: {cause}")))
 }
 
-/// A viewer of a name of its own: several listeners may follow one run.
-fn anonymous(run: &RunId) -> PyResult<Identity> {
-    let cav = CavId::new(&format!("python-{}", std::process::id())).map_err(error)?;
-    Ok(Identity { run: run.clone(), process: process_id(Role::Viewer, &cav), cav })
-}
-
-/// Key expressions of the streams, of the ground truth and of the end of the run.
-fn selectors(run: &RunId, names: Option<Vec<String>>) -> PyResult<Vec<KeyExpr>> {
-    let mut selectors = vec![KeyExpr::control(run)];
-    let Some(names) = names else {
-        selectors.extend(STREAMS.map(|stream| KeyExpr::stream(run, stream)));
-        selectors.push(KeyExpr::truth(run));
-        return Ok(selectors);
-    };
-    for name in names {
-        selectors.push(match name.as_str() {
-            "truth" => KeyExpr::truth(run),
-            "camera" => KeyExpr::cameras(run),
-            "stats" => KeyExpr::stats(run),
-            name => KeyExpr::stream(run, name.parse().map_err(|_| no_stream(name))?),
-        });
-    }
-    Ok(selectors)
-}
-
-fn no_stream(name: &str) -> pyo3::PyErr {
-    let known = "lidar, radar, camera, gnss, imu, pose, bev, boxes, points, detections, descriptor, pace, truth, stats";
-    error(format!("streams: {name:?} is none; there are {known}"))
+/// A viewer of a name of its own: several listeners of a process, or of several, may follow one run.
+fn anonymous() -> PyResult<Principal> {
+    static LISTENERS: AtomicU32 = AtomicU32::new(0);
+    let number = LISTENERS.fetch_add(1, Ordering::Relaxed);
+    let cav = CavId::new(&format!("python-{}-{number}", std::process::id())).map_err(error)?;
+    Ok(Principal::new(Role::Viewer, &cav))
 }

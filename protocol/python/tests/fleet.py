@@ -1,4 +1,6 @@
 """A generated scene, and a fleet that has run over it while a listener followed."""
+import concurrent.futures
+import contextlib
 import json
 import os
 import pathlib
@@ -21,6 +23,18 @@ def call(program: str, *options: object) -> str:
     done = subprocess.run([PROGRAMS / program, *map(str, options)], capture_output=True, text=True, env=ENVIRONMENT)
     assert done.returncode == 0, f"{program}: exit code {done.returncode}\n{done.stderr}"
     return done.stdout
+
+
+@contextlib.contextmanager
+def background(program: str, *options: object):
+    """A program that runs meanwhile."""
+    command = [PROGRAMS / program, *map(str, options)]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=ENVIRONMENT)
+    try:
+        yield
+    finally:
+        process.terminate()
+        process.wait(10)
 
 
 def free_endpoint() -> str:
@@ -52,10 +66,17 @@ class Run:
         command += [word for setting in settings for word in ("--set", setting)]
         with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=ENVIRONMENT) as fleet:
             try:
-                with v2vloc.listen(endpoint, run="fleet", timeout_s=60, settle_s=3) as listener:
-                    frames = list(listener)
-                    self.listener = listener
-                    self.counts = listener.counts
+                # Two listeners, in two threads; a frame waits for its last message on a busy machine too.
+                with concurrent.futures.ThreadPoolExecutor() as pool:
+                    streams = ["lidar", "descriptor", "bev", "truth", "stats"]
+                    others = v2vloc.listen(endpoint, run="fleet", timeout_s=60, streams=streams)
+                    messages = pool.submit(lambda: list(others.messages()))
+                    with v2vloc.listen(endpoint, run="fleet", timeout_s=60, settle_s=3) as listener:
+                        frames = list(listener)
+                        self.listener = listener
+                        self.counts = listener.counts
+                    self.messages = messages.result()
+                    others.close()
             finally:
                 output, errors = fleet.communicate(timeout=60)
         assert fleet.returncode == 0, errors

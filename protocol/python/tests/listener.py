@@ -10,7 +10,7 @@ import numpy as np
 import v2vloc
 
 from data_set import refuses
-from fleet import AREA_M, ENVIRONMENT, FRAMES, PROGRAMS, free_endpoint
+from fleet import AREA_M, FRAMES, background, call, free_endpoint
 
 WAITS = """
 import sys, v2vloc
@@ -55,11 +55,22 @@ def test_what_is_not_there_is_named(run):
     refuses(lambda: v2vloc.listen(endpoint, run="fleet", credentials=run.work), "ca.pem")
 
 
+def test_a_certificate_permits_its_streams(run):
+    keys, endpoint = run.work / "keys", free_endpoint().replace("tcp/", "quic/")
+    call("v2vloc", "keys", "--out", keys, "--agents", "1000", "--egos", "1000", "--hosts", "127.0.0.1")
+    refuses(lambda: v2vloc.listen(endpoint, run="secure", credentials=keys / "viewer", streams=["bev"]),
+            "a certificate of viewer does not permit \"bev\"")
+    with background("v2vloc", "router", "--listen", endpoint, "--keys", keys / "router"):
+        listener = v2vloc.listen(endpoint, run="secure", credentials=keys / "recorder", timeout_s=30)
+        call("sim-replay", "stream", run.scene, "--run", "secure", "--connect", endpoint, "--keys", keys / "replay",
+             "--frames", 2, "--await-agents=false")
+        with listener:
+            assert [list(frame.agents) for frame in listener] == [list(v2vloc.read(run.scene)[0].agents)] * 2
+
+
 def test_a_silent_run_ends_and_ctrl_c_interrupts(run):
     endpoint = free_endpoint()
-    router = subprocess.Popen([PROGRAMS / "v2vloc", "router", "--listen", endpoint], env=ENVIRONMENT,
-                              stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    try:
+    with background("v2vloc", "router", "--listen", endpoint):
         counted = other_thread_counts(lambda: refuses(
             lambda: next(v2vloc.listen(endpoint, run="empty", timeout_s=1)), "no message of run \"empty\""))
         assert counted > 20, f"another thread ran {counted} times"
@@ -70,9 +81,6 @@ def test_a_silent_run_ends_and_ctrl_c_interrupts(run):
         os.kill(waiting.pid, signal.SIGINT)
         _, errors = waiting.communicate(timeout=10)
         assert b"KeyboardInterrupt" in errors and time.monotonic() - began < 5, errors
-    finally:
-        router.terminate()
-        router.wait(10)
 
 
 def other_thread_counts(action) -> int:

@@ -2,9 +2,11 @@
 import struct
 import zlib
 
+import numpy as np
 import v2vloc
 
 from data_set import refuses
+from fleet import FRAMES
 
 
 def header(kind: int, cav: bytes, metadata: bytes) -> bytes:
@@ -41,3 +43,20 @@ def test_bad_messages_are_named(run):
     ]
     for name, data, text in cases:
         refuses(lambda: v2vloc.decode(name, data), text)
+
+
+def test_messages_of_a_live_fleet_have_their_payloads(run):
+    assert run.live
+    payloads: dict[str, list] = {}
+    for message in run.messages:
+        assert message.key.startswith("v2v/fleet/") and message.wire_bytes > 92, message
+        payloads.setdefault(message.kind, []).append(message.payload)
+    assert set(payloads) == {"lidar", "descriptor", "bev", "truth", "stats", "control"}, payloads.keys()
+    points = payloads["lidar"][0]
+    assert points.dtype == np.float32 and points.shape[1] == 4 and len(payloads["lidar"]) == 2 * FRAMES
+    descriptor = payloads["descriptor"][0]
+    assert payloads["bev"][0].features.shape == (descriptor["channels"], descriptor["grid"]["height"],
+                                                 descriptor["grid"]["width"])
+    truth = payloads["truth"][-1]
+    assert truth["tick"] == FRAMES - 1 and len(truth["agents"]["1000"].objects) > 0
+    assert payloads["stats"][-1]["ledger"] is not None
