@@ -36,6 +36,13 @@ impl Polygon {
         Self { corners, low: bound(f64::min), high: bound(f64::max), area }
     }
 
+    /// The footprint of a box: its first four corners ([`crate::Box3d::corners`]), seen from above.
+    #[must_use]
+    pub fn footprint(corners: &[[f64; 3]; 8]) -> Self {
+        let [a, b, c, d, ..] = corners.map(|[x, y, _]| [x, y]);
+        Self::new([a, b, c, d])
+    }
+
     /// Area, square metres.
     #[must_use]
     pub fn area(&self) -> f64 {

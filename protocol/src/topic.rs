@@ -114,6 +114,15 @@ impl Topic {
         }
     }
 
+    /// True if its messages are JSON, without a header.
+    #[must_use]
+    pub fn is_json(&self) -> bool {
+        matches!(
+            self,
+            Self::Stream { stream: Stream::DetectionsJson, .. } | Self::Received { stream: Stream::DetectionsJson, .. }
+        )
+    }
+
     fn from_chunks(chunks: &[&str]) -> Result<Option<Self>, IdError> {
         Ok(match chunks {
             ["truth"] => Some(Self::Truth),

@@ -6,7 +6,6 @@ use criterion::{Criterion, criterion_group, criterion_main};
 use perception::boxes::anchors::Anchors;
 use perception::boxes::decode::decode;
 use perception::boxes::nms::rotated_nms;
-use perception::boxes::postprocess::footprint;
 use perception::model_config::DetectorConfig;
 use protocol::Box3d;
 use protocol::rotated_iou::Polygon;
@@ -28,7 +27,7 @@ fn boxes(count: usize, vehicles: usize, seed: u64) -> (Vec<Polygon>, Vec<f32>) {
                 size_m: [4.2 + near(0.5), 1.8 + near(0.2), 1.6],
                 heading_rad: heading + near(0.2),
             };
-            (footprint(&box3d.corners()), random.random::<f32>())
+            (Polygon::footprint(&box3d.corners()), random.random::<f32>())
         })
         .unzip()
 }

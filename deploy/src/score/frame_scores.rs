@@ -2,9 +2,9 @@
 
 use std::collections::BTreeMap;
 
+use dataset::average_precision::{Ordering, Scorer};
 use dataset::ground_truth::GroundTruthRule;
 use protocol::{Box3d, CavId, Detections, DropReason, Pose, PoseEstimate, Stamp, Truth};
-use training::average_precision::{Ordering, Scorer};
 
 use super::frame_record::{FrameRecord, JudgedFrame, StreamedResult};
 use super::live_precision::{Answer, LivePrecision, TickTruth};

@@ -2,9 +2,9 @@
 
 use std::collections::VecDeque;
 
+use dataset::average_precision::{Ordering, Scorer};
 use perception::boxes::postprocess::is_within;
 use protocol::{Box3d, Detection, Pose};
-use training::average_precision::{Ordering, Scorer};
 
 use super::frame_record::StreamedResult;
 use super::precision::{by_iou, found_by_last};

@@ -1,7 +1,7 @@
 //! Average precision and hits of a scorer.
 
+use dataset::average_precision::{Ordering, Scorer};
 use support::csv_file::CsvText;
-use training::average_precision::{Ordering, Scorer};
 
 use crate::score::metrics::ByIou;
 

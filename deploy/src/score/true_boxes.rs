@@ -1,8 +1,8 @@
 //! Ground-truth boxes of an ego.
 
-use dataset::frame::{Frame, Object, ObjectClass};
+use dataset::frame::Frame;
 use dataset::ground_truth::{self, GroundTruthRule};
-use protocol::{AgentTruth, Box3d, CavId, Handedness, Truth};
+use protocol::{Box3d, CavId, Truth};
 
 /// Ground-truth boxes of the ego, in its LiDAR frame.
 #[must_use]
@@ -13,24 +13,7 @@ pub(crate) fn true_boxes(truth: &Truth, ego: &CavId, rule: &GroundTruthRule) -> 
 /// The same with the ids of the objects.
 #[must_use]
 pub(crate) fn true_objects(truth: &Truth, ego: &CavId, rule: &GroundTruthRule) -> Vec<(i64, Box3d)> {
-    let frames: Vec<Frame> = truth.agents.iter().map(as_frame).collect();
+    let frames: Vec<Frame> = truth.agents.iter().map(Frame::of_truth).collect();
     let Some(ego_index) = frames.iter().position(|frame| frame.cav == *ego) else { return Vec::new() };
     ground_truth::merge(&frames.iter().collect::<Vec<_>>(), ego_index, rule)
-}
-
-/// Part of a recorded frame that the rule reads.
-fn as_frame(agent: &AgentTruth) -> Frame {
-    let class = |name: &str| serde_json::from_value(name.into()).unwrap_or(ObjectClass::Other);
-    let objects = agent.objects.iter().map(|object| Object {
-        id: object.id,
-        class: class(&object.class),
-        world_from_object: object.world_from_object,
-        size_m: object.size_m,
-        speed_mps: object.speed_mps,
-    });
-    Frame {
-        world_from_lidar: Some(agent.world_from_lidar),
-        objects: objects.collect(),
-        ..Frame::empty(agent.cav.clone(), 0, Handedness::Right)
-    }
 }

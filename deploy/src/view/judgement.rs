@@ -2,10 +2,10 @@
 
 use std::collections::BTreeMap;
 
+use dataset::average_precision::{Ordering, Scorer, matches};
 use dataset::ground_truth::GroundTruthRule;
 use protocol::{BevGrid, Detections, Truth};
 use serde::Serialize;
-use training::average_precision::{Ordering, Scorer, matches};
 
 use crate::score::true_objects;
 

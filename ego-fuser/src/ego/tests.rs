@@ -9,7 +9,7 @@ use tch::Device;
 use tch::nn::VarStore;
 
 use super::*;
-use training::average_precision::{Ordering, Scorer};
+use dataset::average_precision::{Ordering, Scorer};
 
 /// Capture time of all sweeps unless stated otherwise.
 const NOW: u64 = 5_000_000_000;

@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Instant;
 
-use protocol::{Control, Key, KeyExpr, Kind, Limits, Stream, Topic, wire};
+use protocol::{Control, Key, KeyExpr, Kind, Limits, Topic, wire};
 use zenoh::Wait;
 use zenoh::bytes::ZBytes;
 use zenoh::sample::Sample;
@@ -131,7 +131,7 @@ impl Shared {
     /// Runs on zenoh's receive thread: reads headers only and waits for nothing.
     fn admit(&self, sample: &Sample, status: &StatusPublisher) {
         let Ok(key) = sample.key_expr().as_str().parse::<Key>() else { return };
-        if has_notifications(&key.topic) && !is_json(&key.topic) {
+        if has_notifications(&key.topic) && !key.topic.is_json() {
             let header = wire::decode_header(sample.payload().slices());
             let is_notice = header.as_ref().is_ok_and(|header| header.kind == Kind::Control);
             let mut gaps = self.gaps.lock().unwrap_or_else(PoisonError::into_inner);
@@ -171,10 +171,6 @@ fn note(topic: &Topic, sample: &Sample, status: &StatusPublisher) {
     if let Ok((_, Control::Probe)) = wire::decode(sample.payload().slices(), &Limits::DEFAULT) {
         status.probed(topic);
     }
-}
-
-fn is_json(topic: &Topic) -> bool {
-    matches!(topic, Topic::Stream { stream: Stream::DetectionsJson, .. })
 }
 
 #[cfg(test)]

@@ -4,7 +4,7 @@
 
 use std::str::FromStr;
 
-use protocol::{Camera, CavId, EgoMotion, Handedness, PointCloud, Pose};
+use protocol::{AgentTruth, Camera, CavId, EgoMotion, Handedness, PointCloud, Pose, TrueObject};
 use serde::{Deserialize, Serialize};
 
 use crate::Problem;
@@ -86,6 +86,15 @@ pub struct Object {
     pub speed_mps: Option<f64>,
 }
 
+impl From<&TrueObject> for Object {
+    /// An object of a message; a class of another version is [`ObjectClass::Other`].
+    fn from(object: &TrueObject) -> Self {
+        let TrueObject { id, class, world_from_object, size_m, speed_mps } = object;
+        let class = class.parse().unwrap_or(ObjectClass::Other);
+        Self { id: *id, class, world_from_object: *world_from_object, size_m: *size_m, speed_mps: *speed_mps }
+    }
+}
+
 /// One sweep of one CAV.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Frame {
@@ -148,6 +157,16 @@ impl Frame {
             cooperative_objects: None,
             problems: Vec::new(),
             source_handedness,
+        }
+    }
+
+    /// Pose and objects of a message of the ground truth.
+    #[must_use]
+    pub fn of_truth(truth: &AgentTruth) -> Self {
+        Self {
+            world_from_lidar: Some(truth.world_from_lidar),
+            objects: truth.objects.iter().map(Object::from).collect(),
+            ..Self::empty(truth.cav.clone(), 0, Handedness::Right)
         }
     }
 

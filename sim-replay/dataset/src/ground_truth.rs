@@ -74,6 +74,16 @@ impl GroundTruthRule {
 /// of the ego the result is empty.
 #[must_use]
 pub fn merge(frames_of_tick: &[&Frame], ego_index: usize, rule: &GroundTruthRule) -> Vec<(i64, Box3d)> {
+    merged_objects(frames_of_tick, ego_index, rule).into_iter().map(|(object, box3d)| (object.id, box3d)).collect()
+}
+
+/// [`merge`] with the annotation that each box is of.
+#[must_use]
+pub fn merged_objects<'a>(
+    frames_of_tick: &[&'a Frame],
+    ego_index: usize,
+    rule: &GroundTruthRule,
+) -> Vec<(&'a Object, Box3d)> {
     let Some(ego) = frames_of_tick.get(ego_index) else { return Vec::new() };
     let Some(world_from_ego) = ego.world_from_lidar else { return Vec::new() };
     let ego_from_world = world_from_ego.isometry().inverse();
@@ -90,7 +100,7 @@ pub fn merge(frames_of_tick: &[&Frame], ego_index: usize, rule: &GroundTruthRule
         for object in listed.iter().filter(|object| rule.classes.contains(object.class)) {
             let box3d = upright_box(object, &ego_from_world);
             if rule.keeps(&box3d) && seen.insert(object.id) {
-                merged.push((object.id, box3d));
+                merged.push((object, box3d));
             }
         }
     }

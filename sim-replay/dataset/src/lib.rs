@@ -18,6 +18,7 @@
 
 mod agent_folders;
 mod annotations;
+pub mod average_precision;
 pub mod camera_files;
 pub mod carla_pose;
 pub mod class_set;
@@ -80,6 +81,7 @@ pub use open::{OpenOptions, open, open_with};
 pub use points::{IntensityScale, IntensityScaleError, Plausibility};
 pub use presence::LoadedTick;
 pub use problem::Problem;
+pub use recorded::recording_of;
 pub use unfinished::UNFINISHED;
 
 use crate::frame::Frame;

@@ -9,7 +9,7 @@ use protocol::{CavId, EgoMotion, Gnss, Handedness, Lidar, Limits, Payload, Radar
 use super::layouts::{LayoutRow, Reader};
 use super::presence::Absences;
 use super::{CameraImages, Dataset, FrameSource, Layout, MissingFrame, OpenOptions, ReadError, Scenario, Tick};
-use crate::frame::{Frame, Object, ObjectClass};
+use crate::frame::{Frame, Object};
 use crate::pcd::{IntensityKind, IntensityOrigin, PcdCloud};
 use recording::{Entry, Recording, RecordingError};
 
@@ -27,14 +27,15 @@ pub(crate) static RECORDING: LayoutRow = LayoutRow {
 const IN_RUN_FOLDER: &str = "recording.mcap";
 
 /// The recording that `path` names: the file itself, or that of a run folder.
-pub(super) fn file_of(path: &Path) -> Option<PathBuf> {
+#[must_use]
+pub fn recording_of(path: &Path) -> Option<PathBuf> {
     let is_recording = |file: &Path| file.is_file() && file.extension().is_some_and(|kind| kind == "mcap");
     [path.to_path_buf(), path.join(IN_RUN_FOLDER)].into_iter().find(|file| is_recording(file))
 }
 
 /// Opens the recording that a path names.
 fn open_given(path: &Path, _: &OpenOptions) -> Result<Option<Dataset>, ReadError> {
-    file_of(path).map(|file| open(&file)).transpose()
+    recording_of(path).map(|file| open(&file)).transpose()
 }
 
 /// Opens a recording as a data set of one scenario. A truncated end is reported in [`Dataset::problems`].
@@ -172,7 +173,7 @@ impl FrameSource for Recorded {
         let truth = self.truth.get(&tick.capture_nanos);
         if let Some(truth) = truth.and_then(|truth| truth.agents.iter().find(|known| known.cav == *agent)) {
             frame.world_from_lidar = Some(truth.world_from_lidar);
-            frame.objects = truth.objects.iter().map(object).collect();
+            frame.objects = truth.objects.iter().map(Object::from).collect();
         }
         if self.sensors.contains_key(&(tick.capture_nanos, agent.clone(), Stream::Gnss)) {
             let gnss: Gnss = self.sensor(agent, tick, Stream::Gnss)?;
@@ -209,16 +210,6 @@ impl FrameSource for Recorded {
 
     fn points_path(&self, _: &CavId, _: &Tick, _: Option<&str>) -> PathBuf {
         self.recording.path().into()
-    }
-}
-
-fn object(object: &protocol::TrueObject) -> Object {
-    Object {
-        id: object.id,
-        class: serde_json::from_value(object.class.as_str().into()).unwrap_or(ObjectClass::Other),
-        world_from_object: object.world_from_object,
-        size_m: object.size_m,
-        speed_mps: object.speed_mps,
     }
 }
 

@@ -4,7 +4,7 @@ use nalgebra::{Isometry3, Matrix4};
 use perception::boxes::anchors::Anchors;
 use perception::boxes::decode::{Decoded, decode, decode_box, sigmoid};
 use perception::boxes::nms::rotated_nms;
-use perception::boxes::postprocess::{self, AgentBoxes, Candidate, PostprocessConfig, corners_to_box, footprint};
+use perception::boxes::postprocess::{self, AgentBoxes, Candidate, PostprocessConfig, corners_to_box};
 use perception::model_config::AnchorConfig;
 use protocol::rotated_iou::Polygon;
 use protocol::{Box3d, Pose};
@@ -60,7 +60,7 @@ fn golden_c3_boxes_iou_nms() {
     let corners: Vec<_> = boxes.iter().map(Box3d::corners).collect();
     let flat: Vec<f32> = corners.iter().flatten().flatten().map(|&value| value as f32).collect();
     assert_close("corners", &flat, &golden.f32("out.corners").1, 1e-4, 0.0);
-    let polygons: Vec<_> = corners.iter().map(footprint).collect();
+    let polygons: Vec<_> = corners.iter().map(Polygon::footprint).collect();
     let iou: Vec<f32> = polygons.iter().flat_map(|a| polygons.iter().map(|b| a.iou(b) as f32)).collect();
     assert_close("IoU", &iou, &golden.f32("out.iou").1, 1e-5, 0.0);
     check_picks(&golden, &polygons);
@@ -184,7 +184,7 @@ impl PostprocessCase {
     /// Input, overlaps with the best box, and picks of the suppression.
     fn check_suppression(&self, golden: &Golden, candidates: &[Candidate]) {
         assert_corners("out.nms_boxes", golden, candidates);
-        let polygons: Vec<_> = candidates.iter().map(|candidate| footprint(&candidate.corners)).collect();
+        let polygons: Vec<_> = candidates.iter().map(|candidate| Polygon::footprint(&candidate.corners)).collect();
         let scores: Vec<f32> = candidates.iter().map(|candidate| candidate.score).collect();
         assert_close("nms scores", &scores, &golden.f32("out.nms_scores").1, 1e-6, 0.0);
         let best = (0..scores.len()).max_by(|&a, &b| scores[a].total_cmp(&scores[b])).expect("candidates");

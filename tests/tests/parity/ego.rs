@@ -1,7 +1,7 @@
 //! Training targets, loss, AP, warps and fusion against the reference implementations.
 
-use ::training::average_precision::{Curve, Ordering, Scorer};
 use ::training::loss::{LabelTensors, LossConfig, Unassigned, detection_loss};
+use dataset::average_precision::{Curve, Ordering, Scorer};
 use fusion::targets::{BOX_CODE, Labels, Positive, TargetAssigner, TargetRule};
 use fusion::warp::opencood::{self, Interpolation};
 use fusion::warp::{coalign, warp_to_ego};

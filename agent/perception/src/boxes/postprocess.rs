@@ -115,7 +115,7 @@ pub fn is_vehicle_sized(corners: &[[f64; 3]; 8], config: &PostprocessConfig) -> 
 /// Rotated non-maximum suppression on the footprints, by descending score.
 #[must_use]
 pub fn suppress(candidates: &[Candidate], config: &PostprocessConfig) -> Vec<Candidate> {
-    let polygons: Vec<Polygon> = candidates.iter().map(|candidate| footprint(&candidate.corners)).collect();
+    let polygons: Vec<Polygon> = candidates.iter().map(|candidate| Polygon::footprint(&candidate.corners)).collect();
     let scores: Vec<f32> = candidates.iter().map(|candidate| candidate.score).collect();
     let kept = rotated_nms(&polygons, &scores, config.nms_iou, config.nms_max_candidates);
     kept.into_iter().map(|index| candidates[index].clone()).collect()
@@ -126,12 +126,6 @@ pub fn suppress(candidates: &[Candidate], config: &PostprocessConfig) -> Vec<Can
 pub fn is_within(corners: &[[f64; 3]; 8], range_m: [f64; 4]) -> bool {
     let [x_low, y_low, x_high, y_high] = range_m;
     corners.iter().all(|&[x, y, _]| (x_low..=x_high).contains(&x) && (y_low..=y_high).contains(&y))
-}
-
-/// Footprint of a box: its first four corners, seen from above.
-#[must_use]
-pub fn footprint(corners: &[[f64; 3]; 8]) -> Polygon {
-    Polygon::new(std::array::from_fn(|corner| [corners[corner][0], corners[corner][1]]))
 }
 
 /// The upright box of eight corners.

@@ -4,6 +4,7 @@ use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
 use anyhow::Result;
+use dataset::average_precision::{Ordering, Scorer, THRESHOLDS};
 use dataset::evaluation_protocol::{EvaluationProtocol, ProtocolConfig};
 use dataset::frame::Frame;
 use dataset::ground_truth;
@@ -18,7 +19,6 @@ use support::cli::BadInput;
 use support::cli::Outcome;
 use support::output;
 use support::progress;
-use training::average_precision::{Ordering, Scorer, THRESHOLDS};
 
 /// A data set with its evaluation protocol.
 struct Data {

@@ -2,6 +2,8 @@
 
 use std::sync::Arc;
 
+use dataset::average_precision::{Ordering, Scorer};
+use fusion::model::CooperativeModel;
 use perception::boxes::postprocess::is_within;
 use protocol::Box3d;
 use rand::SeedableRng;
@@ -10,10 +12,8 @@ use tch::no_grad;
 
 use super::accuracy::Accuracy;
 use super::error::TrainError;
-use crate::average_precision::{Ordering, Scorer};
 use crate::feature_store::MapSource;
 use crate::samples::{Augmentation, Batch, Moments, SampleBuilder, SampleConfig, SampleError, SceneSet, TickRef};
-use fusion::model::CooperativeModel;
 
 /// Measures AP on a fixed choice of frames, each from a fixed vehicle, with no agent missing or late and no added pose
 /// error.

@@ -164,10 +164,7 @@ fn from_corners(field: &Field<'_>) -> Result<Option<(Pose, [f64; 3])>, ReadError
 /// given once.
 #[expect(clippy::indexing_slicing, reason = "indices of the lists that they were taken from")]
 pub(super) fn share_ids(objects: &mut [Object], others: &[Object], lidar_from_world: &Isometry3<f64>) {
-    let footprint = |object: &Object| {
-        let corners = upright_box(object, lidar_from_world).corners();
-        Polygon::new(std::array::from_fn(|corner| [corners[corner][0], corners[corner][1]]))
-    };
+    let footprint = |object: &Object| Polygon::footprint(&upright_box(object, lidar_from_world).corners());
     let own: Vec<Polygon> = objects.iter().map(footprint).collect();
     let theirs: Vec<Polygon> = others.iter().map(footprint).collect();
     let mut overlaps = Vec::new();

@@ -1,14 +1,14 @@
 //! AP of 50 frames at three thresholds in both orderings.
 //!
-//! `cargo bench -p ego-fuser --bench average_precision`
+//! `cargo bench -p dataset --bench average_precision`
 
 use std::hint::black_box;
 
 use criterion::{Criterion, criterion_group, criterion_main};
+use dataset::average_precision::{Ordering, Scorer};
 use protocol::{Box3d, Detection};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use training::average_precision::{Ordering, Scorer};
 
 /// 25 objects and 40 detections, 20 of them on objects: a crowded frame.
 fn frame(rng: &mut impl Rng) -> (Vec<Detection>, Vec<Box3d>) {

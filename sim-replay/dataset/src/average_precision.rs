@@ -7,8 +7,23 @@
 //! The two orderings of the concatenated list differ by many percentage points, so a number without its ordering is of
 //! little use: [`Ordering::Global`] sorts by score over all frames; [`Ordering::Frame`] keeps the frames one after
 //! another (the default of OpenCOOD).
+//!
+//! ```
+//! use protocol::{Box3d, Detection};
+//! use dataset::average_precision::{Ordering, Scorer};
+//!
+//! let car = Box3d { center_m: [10.0, 2.0, -1.0], size_m: [4.5, 1.9, 1.6], heading_rad: 0.1 };
+//! let mut scorer = Scorer::new(&[0.5, 0.7]);
+//! scorer.add(&[Detection { box3d: car, score: 0.9, source: None }], &[car]);
+//! assert_eq!(scorer.average_precisions(Ordering::Global), [1.0, 1.0]);
+//! ```
 
-use perception::boxes::postprocess;
+#![expect(
+    clippy::cast_possible_truncation,
+    clippy::indexing_slicing,
+    reason = "overlaps are compared in f32; indices are of the lists that they were taken from"
+)]
+
 use protocol::rotated_iou::Polygon;
 use protocol::{Box3d, Detection};
 
@@ -143,10 +158,8 @@ impl Scorer {
     }
 }
 
-/// The bottom face of a box seen from above.
-#[must_use]
-pub fn footprint(box3d: &Box3d) -> Polygon {
-    postprocess::footprint(&box3d.corners())
+fn footprint(box3d: &Box3d) -> Polygon {
+    Polygon::footprint(&box3d.corners())
 }
 
 /// Overlap with every object, single precision as in the reference.

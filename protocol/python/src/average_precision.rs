@@ -1,0 +1,134 @@
+//! Average precision of arrays of boxes: the numbers of `v2vloc eval`.
+
+use dataset::average_precision::{Ordering, Scorer};
+use numpy::{PyArrayDyn, PyReadonlyArrayDyn, PyUntypedArrayMethods};
+use protocol::{Box3d, Detection};
+use pyo3::types::{PyAnyMethods, PyDict, PyDictMethods};
+use pyo3::{Bound, IntoPyObject, PyAny, PyResult, Python, pyfunction};
+
+use crate::error::error;
+use crate::payload::{Detections, Objects};
+
+/// Average precision of detections over frames.
+#[pyfunction]
+#[pyo3(signature = (detections, truth, iou=None, *, ordering="global"))]
+pub(crate) fn average_precision<'py>(
+    py: Python<'py>,
+    detections: &Bound<'py, PyAny>,
+    truth: &Bound<'py, PyAny>,
+    iou: Option<&Bound<'py, PyAny>>,
+    ordering: &str,
+) -> PyResult<Bound<'py, PyAny>> {
+    let ordering = match ordering {
+        "global" => Ordering::Global,
+        "frame" => Ordering::Frame,
+        other => return Err(error(format!("ordering: {other:?}, expected \"global\" or \"frame\""))),
+    };
+    let frames = frames(detections, truth)?;
+    let single = match iou {
+        None => Some(0.5),
+        Some(iou) => iou.extract::<f64>().ok(),
+    };
+    let thresholds = match (single, iou) {
+        (Some(iou), _) => vec![iou],
+        (None, iou) => iou.map(PyAnyMethods::extract).transpose()?.unwrap_or_default(),
+    };
+    if let Some(bad) = thresholds.iter().find(|iou| !(**iou > 0.0 && **iou <= 1.0)) {
+        return Err(error(format!("iou: {bad}, expected more than 0, at most 1")));
+    }
+    let found = py.detach(|| {
+        let mut scorer = Scorer::new(&thresholds);
+        frames.iter().for_each(|(detections, objects)| scorer.add(detections, objects));
+        scorer.average_precisions(ordering)
+    });
+    match (single, found.first()) {
+        (Some(_), Some(found)) => Ok(found.into_pyobject(py)?.into_any()),
+        _ => {
+            let by_iou = PyDict::new(py);
+            for (iou, found) in thresholds.iter().zip(found) {
+                by_iou.set_item(iou, found)?;
+            }
+            Ok(by_iou.into_any())
+        }
+    }
+}
+
+type Scored = (Vec<Detection>, Vec<Box3d>);
+
+/// Detections and true boxes of each frame.
+fn frames(detections: &Bound<'_, PyAny>, truth: &Bound<'_, PyAny>) -> PyResult<Vec<Scored>> {
+    let (detections, truth) = (entries("detections", detections)?, entries("truth", truth)?);
+    if detections.len() != truth.len() {
+        let (found, expected) = (detections.len(), truth.len());
+        return Err(error(format!("detections of {found} frames, truth of {expected}")));
+    }
+    let frame = |(index, (found, objects)): (usize, (&Bound<'_, PyAny>, &Bound<'_, PyAny>))| {
+        Ok((scored_boxes(index, found)?, true_boxes(index, objects)?))
+    };
+    detections.iter().zip(&truth).enumerate().map(frame).collect()
+}
+
+fn entries<'py>(name: &str, frames: &Bound<'py, PyAny>) -> PyResult<Vec<Bound<'py, PyAny>>> {
+    let frames = frames.try_iter().map_err(|_| error(format!("{name}: expected one entry per frame")))?;
+    frames.collect()
+}
+
+fn scored_boxes(frame: usize, found: &Bound<'_, PyAny>) -> PyResult<Vec<Detection>> {
+    let py = found.py();
+    let (boxes, scores) = match found.cast::<Detections>() {
+        Ok(found) => {
+            let (boxes, scores) = found.get().scored();
+            (boxes.bind(py).clone().into_any(), scores.bind(py).clone().into_any())
+        }
+        Err(_) => found.extract().map_err(|_| {
+            let kind = found.get_type();
+            error(format!("detections of frame {frame}: {kind}, expected Detections or (boxes, scores)"))
+        })?,
+    };
+    let boxes = boxes_of("detections", frame, &boxes)?;
+    let scores = as_array::<f32>(&scores)?;
+    let scores: Vec<f32> = scores.as_array().iter().copied().collect();
+    if scores.len() != boxes.len() {
+        let (found, expected) = (scores.len(), boxes.len());
+        return Err(error(format!("detections of frame {frame}: {found} scores for {expected} boxes")));
+    }
+    if let Some(bad) = scores.iter().find(|score| !score.is_finite()) {
+        return Err(error(format!("detections of frame {frame}: score {bad}")));
+    }
+    let detection = |(box3d, score)| Detection { box3d, score, source: None };
+    Ok(boxes.into_iter().zip(scores).map(detection).collect())
+}
+
+fn true_boxes(frame: usize, objects: &Bound<'_, PyAny>) -> PyResult<Vec<Box3d>> {
+    let Ok(objects) = objects.cast::<Objects>() else { return boxes_of("truth", frame, objects) };
+    let no_pose =
+        || error(format!("truth of frame {frame}: objects without boxes, as the pose of the LiDAR is unknown"));
+    boxes_of("truth", frame, objects.get().boxes().ok_or_else(no_pose)?.bind(objects.py()).as_any())
+}
+
+/// Rows of an array `[N, 7]`; an empty list is none.
+fn boxes_of(what: &str, frame: usize, boxes: &Bound<'_, PyAny>) -> PyResult<Vec<Box3d>> {
+    let boxes = as_array::<f64>(boxes)?;
+    let shape = boxes.shape().to_vec();
+    if shape != [boxes.len() / 7, 7] && !boxes.is_empty() {
+        return Err(error(format!("{what} of frame {frame}: boxes of shape {shape:?}, expected (N, 7)")));
+    }
+    let values: Vec<f64> = boxes.as_array().iter().copied().collect();
+    if let Some(bad) = values.iter().find(|value| !value.is_finite()) {
+        return Err(error(format!("{what} of frame {frame}: a box with {bad}")));
+    }
+    let box3d = |&[x, y, z, dx, dy, dz, heading_rad]: &[f64; 7]| Box3d {
+        center_m: [x, y, z],
+        size_m: [dx, dy, dz],
+        heading_rad,
+    };
+    Ok(values.as_chunks().0.iter().map(box3d).collect())
+}
+
+/// The array that NumPy makes of a list, or of an array of another type.
+fn as_array<'py, T: numpy::Element>(value: &Bound<'py, PyAny>) -> PyResult<PyReadonlyArrayDyn<'py, T>> {
+    let py = value.py();
+    let made = py.import("numpy")?.call_method1("asarray", (value, T::get_dtype(py)))?;
+    let array = made.cast_into::<PyArrayDyn<T>>().map_err(|cause| error(cause.to_string()))?;
+    Ok(numpy::PyArrayMethods::readonly(&array))
+}

@@ -1,0 +1,165 @@
+//! Data sets: folders of every layout, and recordings of runs, as sequences of frames.
+
+use std::path::PathBuf;
+
+use dataset::evaluation_protocol::{EvaluationProtocol, ProtocolConfig};
+use dataset::{Dataset, Layout, LoadOptions};
+use pyo3::exceptions::PyIndexError;
+use pyo3::{Py, PyErr, PyRef, PyResult, Python, pyclass, pyfunction, pymethods};
+
+use crate::error::error;
+use crate::frame::Frame;
+use crate::frame_parts::{AgentParts, FrameParts};
+use crate::recording_frames::RecordingFrames;
+
+/// Frames of a data set or recording.
+#[pyclass(frozen, module = "v2vloc")]
+pub(crate) struct DataSet {
+    path: PathBuf,
+    options: LoadOptions,
+    protocol: EvaluationProtocol,
+    source: Source,
+}
+
+enum Source {
+    Folder(Dataset),
+    Recording(Box<RecordingFrames>),
+}
+
+impl DataSet {
+    fn count(&self) -> usize {
+        match &self.source {
+            Source::Folder(dataset) => dataset.scenarios.iter().map(|scenario| scenario.ticks.len()).sum(),
+            Source::Recording(recording) => recording.len(),
+        }
+    }
+
+    fn load(&self, index: usize) -> Option<FrameParts> {
+        let dataset = match &self.source {
+            Source::Folder(dataset) => dataset,
+            Source::Recording(recording) => return recording.load(index),
+        };
+        let mut tick = index;
+        for scenario in &dataset.scenarios {
+            let Some(at) = scenario.ticks.get(tick) else {
+                tick -= scenario.ticks.len();
+                continue;
+            };
+            let loaded = scenario.load_tick(tick, scenario.present_agents(tick), &self.options);
+            let mut parts = FrameParts::empty(&scenario.name, at.capture_nanos, &self.protocol);
+            parts.tick = Some(tick as u64);
+            parts.problems.extend(loaded.unreadable.into_iter().map(|(_, problem)| problem.message));
+            for (_, frame) in loaded.frames {
+                parts.problems.extend(frame.problems.iter().map(|problem| problem.message.clone()));
+                parts.agents.push(AgentParts::recorded(frame, self.options.points));
+            }
+            return Some(parts);
+        }
+        None
+    }
+
+    fn frame(&self, py: Python<'_>, index: usize) -> PyResult<Option<Frame>> {
+        py.detach(|| self.load(index)).map(|parts| Frame::new(py, parts)).transpose()
+    }
+}
+
+#[pymethods]
+impl DataSet {
+    fn __len__(&self) -> usize {
+        self.count()
+    }
+
+    fn __getitem__(&self, py: Python<'_>, index: isize) -> PyResult<Frame> {
+        let count = self.count();
+        let wanted = if index < 0 { count.checked_add_signed(index) } else { usize::try_from(index).ok() };
+        let frame = wanted.map(|index| self.frame(py, index)).transpose()?.flatten();
+        frame.ok_or_else(|| PyIndexError::new_err(format!("frame {index} of {count}")))
+    }
+
+    fn __iter__(slf: Py<Self>) -> DataSetIterator {
+        DataSetIterator { data_set: slf, next: 0 }
+    }
+
+    /// Copies open the data set again: worker processes of a data loader.
+    fn __reduce__<'py>(&self, py: Python<'py>) -> PyResult<(pyo3::Bound<'py, pyo3::PyAny>, ReadArguments)> {
+        use pyo3::types::PyAnyMethods;
+        let LoadOptions { points, radar, cameras, .. } = self.options;
+        Ok((py.import("v2vloc")?.getattr("read")?, (self.path.clone(), points, radar, cameras)))
+    }
+
+    #[getter]
+    fn path(&self) -> &PathBuf {
+        &self.path
+    }
+
+    #[getter]
+    fn layout(&self) -> &'static str {
+        match &self.source {
+            Source::Folder(dataset) => dataset.layout.name(),
+            Source::Recording(_) => Layout::RECORDING.name(),
+        }
+    }
+
+    #[getter]
+    fn scenarios(&self) -> Vec<String> {
+        match &self.source {
+            Source::Folder(dataset) => dataset.scenarios.iter().map(|scenario| scenario.name.clone()).collect(),
+            Source::Recording(recording) => vec![recording.run().to_owned()],
+        }
+    }
+
+    #[getter]
+    fn problems(&self) -> Vec<String> {
+        match &self.source {
+            Source::Folder(dataset) => dataset.problems.iter().map(ToString::to_string).collect(),
+            Source::Recording(recording) => recording.problems(),
+        }
+    }
+
+    fn __repr__(&self) -> String {
+        format!("DataSet({:?}, {}, {} frames)", self.path, self.layout(), self.count())
+    }
+}
+
+type ReadArguments = (PathBuf, bool, bool, bool);
+
+/// The frames of a data set in order.
+#[pyclass(module = "v2vloc")]
+pub(crate) struct DataSetIterator {
+    data_set: Py<DataSet>,
+    next: usize,
+}
+
+#[pymethods]
+impl DataSetIterator {
+    fn __iter__(slf: PyRef<'_, Self>) -> PyRef<'_, Self> {
+        slf
+    }
+
+    fn __next__(&mut self, py: Python<'_>) -> PyResult<Option<Frame>> {
+        self.next += 1;
+        self.data_set.get().frame(py, self.next - 1)
+    }
+}
+
+/// Opens a data set, or a recording of a run.
+#[pyfunction]
+#[pyo3(signature = (path, points=true, radar=false, cameras=false))]
+pub(crate) fn read(py: Python<'_>, path: PathBuf, points: bool, radar: bool, cameras: bool) -> PyResult<DataSet> {
+    let options = LoadOptions { points, radar, cameras, ..LoadOptions::default() };
+    let protocol = |layout: Layout| ProtocolConfig::default().resolve(layout).map_err(error);
+    let opened: Result<_, PyErr> = py.detach(|| match dataset::recording_of(&path) {
+        Some(file) => {
+            let protocol = protocol(Layout::RECORDING)?;
+            let recording = RecordingFrames::open(&file, &options, protocol.clone()).map_err(error)?;
+            Ok((Source::Recording(Box::new(recording)), protocol))
+        }
+        None => {
+            let dataset = dataset::open(&path).map_err(error)?;
+            let protocol = protocol(dataset.layout)?;
+            Ok((Source::Folder(dataset), protocol))
+        }
+    });
+    let (source, protocol) = opened?;
+    Ok(DataSet { path, options, protocol, source })
+}

@@ -1,0 +1,161 @@
+//! Messages of the wire format, one at a time.
+
+use protocol::{CavId, Header, Key, Kind, Limits, Message as WireMessage, Topic, wire};
+use pyo3::types::PyAnyMethods;
+use pyo3::types::{PyDict, PyDictMethods};
+use pyo3::{Py, PyAny, PyResult, Python, pyclass, pyfunction, pymethods};
+
+use crate::arrays;
+use crate::error::error;
+use crate::frame::Agent;
+use crate::frame_parts::{AgentParts, decode_stream};
+use crate::json;
+use crate::payload::{Bev, Camera, DecodedBev, Detections, PoseEstimate};
+
+/// One message: header and payload.
+#[pyclass(frozen, get_all, module = "v2vloc")]
+pub(crate) struct Message {
+    key: Option<String>,
+    kind: String,
+    cav: String,
+    epoch: u64,
+    sequence: u64,
+    capture_time_ns: u64,
+    publish_time_ns: u64,
+    wire_bytes: usize,
+    payload: Py<PyAny>,
+}
+
+/// A decoded message before Python sees it.
+pub(crate) struct Decoded {
+    header: Header,
+    content: Content,
+    wire_bytes: usize,
+}
+
+enum Content {
+    Bev(DecodedBev),
+    Other(WireMessage),
+}
+
+impl Decoded {
+    /// Decodes a message, which has to be of `kind` if one is given.
+    fn of_kind(kind: Option<Kind>, bytes: &[u8]) -> Result<Self, protocol::WireError> {
+        let header = wire::decode_header([bytes])?;
+        match kind {
+            Some(expected) if expected != header.kind => {
+                return Err(protocol::WireError::Kind { expected, found: header.kind });
+            }
+            _ => {}
+        }
+        let (header, message) = wire::decode_any([bytes], &Limits::DEFAULT)?;
+        Self::new(header, message, bytes.len())
+    }
+
+    /// Decodes a message that was published on a key.
+    pub(crate) fn of_key(key: &Key, bytes: &[u8]) -> Result<Self, protocol::WireError> {
+        let kind = match &key.topic {
+            Topic::Stream { cav, stream } | Topic::Received { cav, stream, .. } => {
+                let header = wire::decode_header([bytes])?;
+                let message = decode_stream(cav, *stream, [bytes])?;
+                return Self::new(header, message, bytes.len());
+            }
+            Topic::Truth => Kind::Truth,
+            Topic::Stats(_) => Kind::Stats,
+            Topic::Control(_) | Topic::Ready(_) | Topic::Alive { .. } => Kind::Control,
+        };
+        Self::of_kind(Some(kind), bytes)
+    }
+
+    fn new(header: Header, message: WireMessage, wire_bytes: usize) -> Result<Self, protocol::WireError> {
+        let content = match message {
+            WireMessage::Bev(bev) => Content::Bev(DecodedBev::decode(bev)?),
+            message => Content::Other(message),
+        };
+        Ok(Self { header, content, wire_bytes })
+    }
+}
+
+impl Message {
+    pub(crate) fn new(py: Python<'_>, key: Option<String>, decoded: Decoded) -> PyResult<Self> {
+        let Decoded { header: Header { kind, stamp, .. }, content, wire_bytes } = decoded;
+        let payload = match content {
+            Content::Bev(bev) => Bev::new(py, bev)?.into_any(),
+            Content::Other(message) => payload(py, &stamp.cav, message)?,
+        };
+        Ok(Self {
+            key,
+            kind: kind.to_string(),
+            cav: stamp.cav.to_string(),
+            epoch: stamp.epoch,
+            sequence: stamp.sequence,
+            capture_time_ns: stamp.capture_nanos,
+            publish_time_ns: stamp.publish_nanos,
+            wire_bytes,
+            payload,
+        })
+    }
+}
+
+fn payload(py: Python<'_>, cav: &CavId, message: WireMessage) -> PyResult<Py<PyAny>> {
+    Ok(match message {
+        WireMessage::Lidar(sweep) => arrays::rows(py, sweep.points.xyzi)?.into_any(),
+        WireMessage::Radar(sweep) => arrays::rows(py, sweep.points.xyzi)?.into_any(),
+        WireMessage::Pose(pose) => PoseEstimate::new(py, &pose)?.into_any(),
+        WireMessage::Boxes(boxes) => Detections::of_agent(py, cav.as_str(), &boxes)?.into_any(),
+        WireMessage::Detections(found) => Detections::of_ego(py, &found)?.into_any(),
+        WireMessage::Camera(camera) => Camera::new(py, &camera)?.into_any(),
+        WireMessage::Points(sent) => Agent::new(py, AgentParts::of_points(cav, sent))?.0.into_any(),
+        WireMessage::Truth(truth) => {
+            let agents = PyDict::new(py);
+            for parts in AgentParts::of_truth(&truth) {
+                let (agent, recorded) = Agent::new(py, parts)?;
+                agents.set_item(recorded.cav.as_str(), agent)?;
+            }
+            let made = PyDict::new(py);
+            made.set_item("tick", truth.tick)?;
+            made.set_item("agents", agents)?;
+            made.into_any().unbind()
+        }
+        WireMessage::Gnss(gnss) => {
+            let made = json::to_python(py, &gnss)?;
+            made.set_item("world_from_lidar", arrays::pose(py, &gnss.world_from_lidar)?)?;
+            made.unbind()
+        }
+        WireMessage::Imu(motion) => json::to_python(py, &motion)?.unbind(),
+        WireMessage::Pace(pace) => json::to_python(py, &pace)?.unbind(),
+        WireMessage::Descriptor(descriptor) => json::to_python(py, &descriptor)?.unbind(),
+        WireMessage::Control(control) => json::to_python(py, &control)?.unbind(),
+        WireMessage::Stats(stats) => json::to_python(py, &stats)?.unbind(),
+        // Decoded before, outside of Python's lock.
+        WireMessage::Bev(bev) => Bev::new(py, DecodedBev::decode(bev).map_err(error)?)?.into_any(),
+    })
+}
+
+#[pymethods]
+impl Message {
+    fn __repr__(&self) -> String {
+        let (seconds, place) = (self.capture_time_ns as f64 * 1e-9, self.key.as_deref().unwrap_or(&self.cav));
+        format!("Message({}, {place:?}, t={seconds:.3} s, {} bytes)", self.kind, self.wire_bytes)
+    }
+}
+
+/// Decodes one message of the wire format.
+#[pyfunction]
+pub(crate) fn decode(py: Python<'_>, kind_or_key: &str, data: &[u8]) -> PyResult<Message> {
+    let named = |cause: &dyn std::fmt::Display| error(format!("{kind_or_key}: {cause}"));
+    if !kind_or_key.contains('/') {
+        let kind = Kind::ALL.into_iter().find(|kind| kind.to_string() == kind_or_key);
+        let known = || Kind::ALL.map(|kind| kind.to_string()).join(", ");
+        let kind =
+            kind.ok_or_else(|| error(format!("{kind_or_key:?} is no kind of message; there are {}", known())))?;
+        let decoded = py.detach(|| Decoded::of_kind(Some(kind), data));
+        return Message::new(py, None, decoded.map_err(|cause| named(&cause))?);
+    }
+    let key: Key = kind_or_key.parse().map_err(|cause: protocol::KeyError| named(&cause))?;
+    if key.topic.is_json() {
+        return Err(named(&"messages of this key are JSON: use json.loads"));
+    }
+    let decoded = py.detach(|| Decoded::of_key(&key, data)).map_err(|cause| named(&cause))?;
+    Message::new(py, Some(kind_or_key.to_owned()), decoded)
+}

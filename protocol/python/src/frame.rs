@@ -1,0 +1,171 @@
+//! Frames: everything of one capture time, by agent, and the ground truth of an ego.
+
+use dataset::evaluation_protocol::EvaluationProtocol;
+use dataset::frame;
+use dataset::ground_truth;
+use numpy::{PyArray2, PyUntypedArrayMethods};
+use protocol::{Box3d, Pose};
+use pyo3::types::{PyDict, PyDictMethods};
+use pyo3::{Py, PyResult, Python, pyclass, pymethods};
+
+use crate::arrays::{self, Matrix};
+use crate::error::error;
+use crate::frame_parts::{AgentParts, FrameParts};
+use crate::payload::{Bev, Camera, Detections, Objects, PoseEstimate};
+
+/// One agent at one capture time.
+#[pyclass(frozen, get_all, module = "v2vloc")]
+pub(crate) struct Agent {
+    cav: String,
+    points: Option<Py<PyArray2<f32>>>,
+    radar: Option<Py<PyArray2<f32>>>,
+    cameras: Py<PyDict>,
+    world_from_lidar: Option<Matrix>,
+    gnss_world_from_lidar: Option<Matrix>,
+    speed_mps: Option<f64>,
+    yaw_rate_rad_s: Option<f64>,
+    objects: Py<Objects>,
+    pose: Option<Py<PoseEstimate>>,
+    bev: Option<Py<Bev>>,
+    boxes: Option<Py<Detections>>,
+}
+
+impl Agent {
+    /// Converts all parts but the ground truth, which stays in the frame as well.
+    pub(crate) fn new(py: Python<'_>, parts: AgentParts) -> PyResult<(Py<Self>, frame::Frame)> {
+        let AgentParts { mut recorded, has_points, gnss_world_from_lidar, pose, bev, boxes } = parts;
+        let matrix = |pose: Option<&Pose>| pose.map(|pose| arrays::pose(py, pose)).transpose();
+        let cameras = PyDict::new(py);
+        for (number, camera) in std::mem::take(&mut recorded.cameras) {
+            cameras.set_item(number, Camera::new(py, &camera)?)?;
+        }
+        let cav = recorded.cav.to_string();
+        let points = std::mem::take(&mut recorded.points).xyzi;
+        let radar = recorded.radar.take();
+        let made = Self {
+            points: has_points.then(|| arrays::rows(py, points)).transpose()?,
+            radar: radar.map(|sweep| arrays::rows(py, sweep.xyzi)).transpose()?,
+            cameras: cameras.unbind(),
+            world_from_lidar: matrix(recorded.world_from_lidar.as_ref())?,
+            gnss_world_from_lidar: matrix(gnss_world_from_lidar.as_ref())?,
+            speed_mps: recorded.speed_mps,
+            yaw_rate_rad_s: recorded.yaw_rate_rad_s,
+            objects: Objects::annotated(py, &recorded)?,
+            pose: pose.map(|pose| PoseEstimate::new(py, &pose)).transpose()?,
+            bev: bev.map(|bev| Bev::new(py, bev)).transpose()?,
+            boxes: boxes.map(|boxes| Detections::of_agent(py, &cav, &boxes)).transpose()?,
+            cav,
+        };
+        Ok((Py::new(py, made)?, recorded))
+    }
+}
+
+#[pymethods]
+impl Agent {
+    fn __repr__(&self, py: Python<'_>) -> String {
+        let mut parts = vec![format!("{:?}", self.cav)];
+        let count = |points: &Py<PyArray2<f32>>| points.bind(py).shape().first().copied().unwrap_or(0);
+        parts.extend(self.points.as_ref().map(|points| format!("{} points", count(points))));
+        parts.extend(self.radar.as_ref().map(|points| format!("{} radar points", count(points))));
+        let here: [(&str, bool); 5] = [
+            ("true pose", self.world_from_lidar.is_some()),
+            ("pose", self.pose.is_some()),
+            ("bev", self.bev.is_some()),
+            ("boxes", self.boxes.is_some()),
+            ("cameras", !self.cameras.bind(py).is_empty()),
+        ];
+        parts.extend(here.iter().filter(|(_, is_here)| *is_here).map(|(name, _)| (*name).to_owned()));
+        format!("Agent({})", parts.join(", "))
+    }
+}
+
+/// Everything of one capture time.
+#[pyclass(frozen, module = "v2vloc")]
+pub(crate) struct Frame {
+    #[pyo3(get)]
+    source: String,
+    #[pyo3(get)]
+    tick: Option<u64>,
+    #[pyo3(get)]
+    capture_time_ns: u64,
+    #[pyo3(get)]
+    agents: Py<PyDict>,
+    #[pyo3(get)]
+    detections: Py<PyDict>,
+    #[pyo3(get)]
+    problems: Vec<String>,
+    #[pyo3(get)]
+    ego: Option<String>,
+    truth: Vec<frame::Frame>,
+    protocol: EvaluationProtocol,
+}
+
+impl Frame {
+    pub(crate) fn new(py: Python<'_>, parts: FrameParts) -> PyResult<Self> {
+        let FrameParts { source, tick, capture_nanos, agents: parts, detections: results, problems, protocol } = parts;
+        let (agents, detections) = (PyDict::new(py), PyDict::new(py));
+        let mut truth = Vec::with_capacity(parts.len());
+        for agent in parts {
+            let (agent, recorded) = Agent::new(py, agent)?;
+            agents.set_item(recorded.cav.as_str(), agent)?;
+            truth.push(recorded);
+        }
+        for result in &results {
+            detections.set_item(result.ego.as_str(), Detections::of_ego(py, result)?)?;
+        }
+        let ego = results.first().map(|result| &result.ego).or(truth.first().map(|agent| &agent.cav));
+        Ok(Self {
+            source,
+            tick,
+            capture_time_ns: capture_nanos,
+            agents: agents.unbind(),
+            detections: detections.unbind(),
+            problems,
+            ego: ego.map(ToString::to_string),
+            truth,
+            protocol,
+        })
+    }
+
+    fn rule(&self, protocol: Option<&str>) -> PyResult<EvaluationProtocol> {
+        let Some(name) = protocol else { return Ok(self.protocol.clone()) };
+        let known = || dataset::evaluation_protocol::PRESETS.map(|(name, _)| name).join(", ");
+        EvaluationProtocol::preset(name)
+            .ok_or_else(|| error(format!("unknown protocol {name:?}; there are {}", known())))
+    }
+}
+
+#[pymethods]
+impl Frame {
+    /// Objects that an ego is expected to find.
+    #[pyo3(signature = (ego=None, *, protocol=None, area_m=None))]
+    fn ground_truth(
+        &self,
+        py: Python<'_>,
+        ego: Option<String>,
+        protocol: Option<&str>,
+        area_m: Option<[f64; 6]>,
+    ) -> PyResult<Py<Objects>> {
+        let protocol = self.rule(protocol)?;
+        let rule = area_m.map_or(protocol.ground_truth, |area_m| protocol.rule_within(area_m));
+        let ego = ego.or_else(|| self.ego.clone()).unwrap_or_default();
+        let index = self.truth.iter().position(|agent| agent.cav.as_str() == ego);
+        let no_pose = || error(format!("no true pose of agent {ego:?} in {}", self.__repr__(py)));
+        let index = index.filter(|&index| self.truth[index].world_from_lidar.is_some()).ok_or_else(no_pose)?;
+        let frames: Vec<&frame::Frame> = self.truth.iter().collect();
+        let (objects, boxes): (Vec<&frame::Object>, Vec<Box3d>) =
+            ground_truth::merged_objects(&frames, index, &rule).into_iter().unzip();
+        Objects::new(py, &objects, Some(&boxes))
+    }
+
+    fn __repr__(&self, py: Python<'_>) -> String {
+        let agents = self.agents.bind(py).keys();
+        let tick = self.tick.map_or(String::new(), |tick| format!(", tick={tick}"));
+        let detections = match self.detections.bind(py).len() {
+            0 => String::new(),
+            count => format!(", detections of {count}"),
+        };
+        let seconds = self.capture_time_ns as f64 * 1e-9;
+        format!("Frame({:?}{tick}, t={seconds:.3} s, agents={agents}{detections})", self.source)
+    }
+}

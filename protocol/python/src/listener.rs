@@ -1,0 +1,296 @@
+//! Listener: follows a live run as a passive subscriber and hands over its frames, or its messages.
+
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::time::{Duration, Instant};
+
+use bus::bounded_queue::Pop;
+use bus::{Bus, BusOptions, Credentials, Endpoint, Identity, PassiveSubscriber, RawMessage};
+use dataset::evaluation_protocol::EvaluationProtocol;
+use protocol::{CavId, Principal, Role, RunId, Topic, Verb};
+use pyo3::types::{PyDict, PyDictMethods};
+use pyo3::{Bound, Py, PyAny, PyRef, PyRefMut, PyResult, Python, pyclass, pyfunction, pymethods};
+
+use crate::decode::{Decoded, Message};
+use crate::error::error;
+use crate::frame::Frame;
+use crate::frame_parts::is_part_of_frames;
+use crate::live_frames::LiveFrames;
+use crate::subscriptions::{self, Access};
+
+/// Interval between two checks for Ctrl-C.
+const POLL: Duration = Duration::from_millis(50);
+/// Longest time for reaching the router.
+const CONNECT_LIMIT: Duration = Duration::from_secs(10);
+/// Longest time for closing the connection.
+const CLOSE_LIMIT: Duration = Duration::from_secs(2);
+/// Queued messages of each topic.
+const PLACES: usize = 64;
+/// Messages that cannot be decoded and are named; all are counted.
+const MOST_NAMED: usize = 100;
+
+/// Frames of a live run as they arrive.
+#[pyclass(module = "v2vloc")]
+pub(crate) struct Listener {
+    connection: Option<Connection>,
+    run: RunId,
+    endpoint: Endpoint,
+    timeout: Option<Duration>,
+    settle: Duration,
+    frames: LiveFrames,
+    last_message: Instant,
+    messages: u64,
+    undecodable: u64,
+    problems: Vec<String>,
+    /// The replay has published its end.
+    is_over: bool,
+}
+
+struct Connection {
+    bus: Bus,
+    subscriber: PassiveSubscriber,
+}
+
+/// What the next step of a listener gave.
+enum Step {
+    Message(RawMessage),
+    /// Nothing within the poll interval.
+    Waiting,
+    /// No message will follow.
+    End,
+}
+
+impl Listener {
+    /// The next message; waits without Python's lock, and lets Ctrl-C interrupt.
+    fn step(&mut self, py: Python<'_>) -> PyResult<Step> {
+        py.check_signals()?;
+        let Some(Connection { subscriber, .. }) = &self.connection else { return Ok(Step::End) };
+        match py.detach(|| subscriber.take(Some(Instant::now() + POLL))) {
+            Pop::Item(_, message) => {
+                self.last_message = Instant::now();
+                if matches!(message.key.topic, Topic::Control(Verb::End)) {
+                    self.is_over = true;
+                } else if !matches!(message.key.topic, Topic::Control(_)) {
+                    self.messages += 1;
+                }
+                Ok(Step::Message(message))
+            }
+            Pop::Closed => Ok(Step::End),
+            Pop::TimedOut => self.silence(),
+        }
+    }
+
+    /// Nothing has arrived: the end, or a run that is not there.
+    fn silence(&self) -> PyResult<Step> {
+        let silent = self.last_message.elapsed();
+        if self.is_over && silent >= self.settle {
+            return Ok(Step::End);
+        }
+        match self.timeout {
+            Some(timeout) if silent >= timeout && self.messages == 0 => Err(error(format!(
+                "no message of run {:?} at {} within {:.1} s: `v2vloc status` lists runs",
+                self.run.as_str(),
+                self.endpoint,
+                timeout.as_secs_f64()
+            ))),
+            Some(timeout) if silent >= timeout => Ok(Step::End),
+            _ => Ok(Step::Waiting),
+        }
+    }
+
+    /// Counts a message that cannot be decoded, and names it.
+    fn reject(&mut self, key: &protocol::Key, cause: &protocol::WireError) {
+        self.undecodable += 1;
+        if self.problems.len() < MOST_NAMED {
+            self.problems.push(format!("{key}: {cause}"));
+        }
+    }
+
+    fn next_message(&mut self, py: Python<'_>) -> PyResult<Option<Message>> {
+        loop {
+            let message = match self.step(py)? {
+                Step::Message(message) if message.key.topic.is_json() => continue,
+                Step::Message(message) => message,
+                Step::Waiting => continue,
+                Step::End => return Ok(None),
+            };
+            match py.detach(|| Decoded::of_key(&message.key, &message.bytes())) {
+                Ok(decoded) => return Message::new(py, Some(message.key.to_string()), decoded).map(Some),
+                Err(cause) => self.reject(&message.key, &cause),
+            }
+        }
+    }
+
+    fn disconnect(&mut self) {
+        if let Some(Connection { bus, subscriber }) = self.connection.take() {
+            drop(subscriber);
+            // A connection that does not close in time closes with the process.
+            let _ = bus.leave(CLOSE_LIMIT);
+        }
+    }
+}
+
+impl Drop for Listener {
+    fn drop(&mut self) {
+        self.disconnect();
+    }
+}
+
+#[pymethods]
+impl Listener {
+    fn __iter__(slf: PyRef<'_, Self>) -> PyRef<'_, Self> {
+        slf
+    }
+
+    fn __next__(&mut self, py: Python<'_>) -> PyResult<Option<Frame>> {
+        loop {
+            if let Some(parts) = self.frames.next() {
+                return Frame::new(py, parts).map(Some);
+            }
+            match self.step(py)? {
+                Step::Message(message) if is_part_of_frames(&message.key.topic) => {
+                    let frames = &mut self.frames;
+                    if let Err(cause) = py.detach(|| frames.add(&message)) {
+                        self.reject(&message.key, &cause);
+                    }
+                }
+                Step::Message(_) | Step::Waiting => {}
+                Step::End => {
+                    self.frames.finish();
+                    return self.frames.next().map(|parts| Frame::new(py, parts)).transpose();
+                }
+            }
+        }
+    }
+
+    /// Single messages instead of frames.
+    fn messages(slf: Py<Self>) -> MessageIterator {
+        MessageIterator { listener: slf }
+    }
+
+    /// Leaves the run.
+    fn close(&mut self, py: Python<'_>) {
+        py.detach(|| self.disconnect());
+    }
+
+    fn __enter__(slf: PyRef<'_, Self>) -> PyRef<'_, Self> {
+        slf
+    }
+
+    #[pyo3(signature = (*_cause))]
+    fn __exit__(&mut self, py: Python<'_>, _cause: &Bound<'_, PyAny>) {
+        self.close(py);
+    }
+
+    #[getter]
+    fn run(&self) -> &str {
+        self.run.as_str()
+    }
+
+    #[getter]
+    fn problems(&self) -> Vec<String> {
+        self.problems.clone()
+    }
+
+    #[getter]
+    fn counts<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let subscriber = self.connection.as_ref().map(|connection| &connection.subscriber);
+        let counts = PyDict::new(py);
+        for (name, count) in [
+            ("messages", self.messages),
+            ("undecodable", self.undecodable),
+            ("late", self.frames.late),
+            ("overwritten", subscriber.map_or(0, PassiveSubscriber::overwritten)),
+            ("undelivered", subscriber.map_or(0, PassiveSubscriber::undelivered)),
+        ] {
+            counts.set_item(name, count)?;
+        }
+        Ok(counts)
+    }
+
+    fn __repr__(&self) -> String {
+        let state = if self.connection.is_some() { "" } else { ", closed" };
+        format!("Listener(run={:?}, {} messages{state})", self.run.as_str(), self.messages)
+    }
+}
+
+/// Messages of a live run as they arrive.
+#[pyclass(module = "v2vloc")]
+pub(crate) struct MessageIterator {
+    listener: Py<Listener>,
+}
+
+#[pymethods]
+impl MessageIterator {
+    fn __iter__(slf: PyRef<'_, Self>) -> PyRef<'_, Self> {
+        slf
+    }
+
+    fn __next__(&self, py: Python<'_>) -> PyResult<Option<Message>> {
+        let mut listener: PyRefMut<'_, Listener> = self.listener.try_borrow_mut(py)?;
+        listener.next_message(py)
+    }
+}
+
+/// Follows a live run.
+#[pyfunction]
+#[pyo3(signature = (endpoint="tcp/127.0.0.1:7447", run=None, *, timeout_s=Some(10.0), credentials=None, streams=None, settle_s=1.0))]
+pub(crate) fn listen(
+    py: Python<'_>,
+    endpoint: &str,
+    run: Option<&str>,
+    timeout_s: Option<f64>,
+    credentials: Option<PathBuf>,
+    streams: Option<Vec<String>>,
+    settle_s: f64,
+) -> PyResult<Listener> {
+    let run =
+        run.ok_or_else(|| error("run: give the name of the run; `v2vloc up` prints it, `v2vloc status` lists runs"))?;
+    let run = RunId::new(run).map_err(error)?;
+    let endpoint = Endpoint::new(endpoint).map_err(error)?;
+    let timeout = timeout_s.map(|seconds| seconds_of("timeout_s", seconds)).transpose()?;
+    let settle = seconds_of("settle_s", settle_s)?;
+    let mut options = BusOptions::client(endpoint.clone());
+    options.connect_timeout = timeout.unwrap_or(CONNECT_LIMIT).min(CONNECT_LIMIT);
+    let (mut principal, mut access) = (anonymous()?, Access::All);
+    if let Some(folder) = credentials {
+        let credentials = Credentials::read(&folder).map_err(error)?;
+        principal = credentials.name().parse().map_err(error)?;
+        access = Access::of(&principal, &run);
+        options = options.with_credentials(credentials);
+    }
+    let selectors = subscriptions::selectors(&run, streams, &access)?;
+    let identity = Identity { run: run.clone(), process: principal.name(), cav: principal.cav };
+    let connect = || {
+        let bus = Bus::join(&options, identity)?;
+        let subscriber = bus.tap(&selectors, PLACES)?;
+        Ok(Connection { bus, subscriber })
+    };
+    let connection = py.detach(connect).map_err(|cause: bus::BusError| error(cause))?;
+    let protocol = EvaluationProtocol::preset("opv2v").ok_or_else(|| error("no protocol opv2v"))?;
+    Ok(Listener {
+        connection: Some(connection),
+        frames: LiveFrames::new(run.as_str(), settle, protocol),
+        run,
+        endpoint,
+        timeout,
+        settle,
+        last_message: Instant::now(),
+        messages: 0,
+        undecodable: 0,
+        problems: Vec::new(),
+        is_over: false,
+    })
+}
+
+fn seconds_of(name: &str, seconds: f64) -> PyResult<Duration> {
+    Duration::try_from_secs_f64(seconds).map_err(|cause| error(format!("{name}: {seconds}: {cause}")))
+}
+
+/// A viewer of a name of its own: several listeners of a process, or of several, may follow one run.
+fn anonymous() -> PyResult<Principal> {
+    static LISTENERS: AtomicU32 = AtomicU32::new(0);
+    let number = LISTENERS.fetch_add(1, Ordering::Relaxed);
+    let cav = CavId::new(&format!("python-{}-{number}", std::process::id())).map_err(error)?;
+    Ok(Principal::new(Role::Viewer, &cav))
+}

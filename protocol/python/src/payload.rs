@@ -1,0 +1,293 @@
+//! Payloads of messages and parts of frames: pose estimate, feature map, detections, objects, image.
+
+use dataset::frame::{Frame, Object};
+use dataset::ground_truth::upright_box;
+use numpy::{PyArray1, PyArray2, PyArray3, PyArrayMethods};
+use protocol::{BevGrid, Box3d, CameraMetadata, Codec, DecodedFeatures, Detection, Pose};
+use pyo3::types::{PyBytes, PyDict, PyDictMethods, PyList};
+use pyo3::{Py, PyAny, PyResult, Python, pyclass, pymethods};
+
+use crate::arrays::{self, Matrix};
+use crate::json;
+
+/// Pose estimate of an agent, or the reason why it has none.
+#[pyclass(frozen, get_all, module = "v2vloc")]
+pub(crate) struct PoseEstimate {
+    world_from_cav: Option<Matrix>,
+    confidence: Option<f32>,
+    covariance: Option<Matrix>,
+    no_pose_reason: Option<String>,
+    inlier_count: Option<u32>,
+}
+
+impl PoseEstimate {
+    pub(crate) fn new(py: Python<'_>, estimate: &protocol::PoseEstimate) -> PyResult<Py<Self>> {
+        let made = match estimate {
+            protocol::PoseEstimate::Pose { world_from_cav, confidence, covariance } => Self {
+                world_from_cav: Some(arrays::pose(py, world_from_cav)?),
+                confidence: Some(*confidence),
+                covariance: covariance.as_ref().map(|one| arrays::covariance(py, one)).transpose()?,
+                no_pose_reason: None,
+                inlier_count: None,
+            },
+            protocol::PoseEstimate::NoPose { reason, inlier_count } => Self {
+                world_from_cav: None,
+                confidence: None,
+                covariance: None,
+                no_pose_reason: Some(json::name(reason)?),
+                inlier_count: Some(*inlier_count),
+            },
+        };
+        Py::new(py, made)
+    }
+}
+
+#[pymethods]
+impl PoseEstimate {
+    fn __repr__(&self, py: Python<'_>) -> String {
+        let (Some(matrix), Some(confidence)) = (&self.world_from_cav, self.confidence) else {
+            return format!("PoseEstimate(no pose: {})", self.no_pose_reason.as_deref().unwrap_or_default());
+        };
+        let matrix = matrix.bind(py).readonly();
+        let at = |row: usize, column: usize| matrix.get([row, column]).copied().unwrap_or(f64::NAN);
+        let yaw_deg = at(1, 0).atan2(at(0, 0)).to_degrees();
+        let [x, y, z] = [0, 1, 2].map(|row| at(row, 3));
+        format!(
+            "PoseEstimate(x={x:.2}, y={y:.2}, z={z:.2} m, yaw={yaw_deg:.1} deg, confidence={confidence:.3}{})",
+            if self.covariance.is_some() { ", covariance" } else { "" }
+        )
+    }
+}
+
+/// BEV feature map of an agent.
+#[pyclass(frozen, get_all, module = "v2vloc")]
+pub(crate) struct Bev {
+    features: Py<PyArray3<f32>>,
+    mask: Option<Py<PyArray2<bool>>>,
+    x_min_m: f64,
+    y_min_m: f64,
+    cell_m: f64,
+    code_of: Option<u32>,
+    dtype: String,
+    payload_bytes: usize,
+    pose: Py<PoseEstimate>,
+}
+
+/// A decoded feature map with its format and size on the wire.
+pub(crate) struct DecodedBev {
+    pub(crate) pose: protocol::PoseEstimate,
+    pub(crate) decoded: DecodedFeatures,
+    pub(crate) codec: Codec,
+    /// Bytes of the body.
+    pub(crate) payload_bytes: usize,
+}
+
+impl DecodedBev {
+    pub(crate) fn decode(bev: protocol::Bev) -> Result<Self, protocol::WireError> {
+        let protocol::Bev { pose, features } = bev;
+        let (codec, payload_bytes) = (features.codec, features.body.len());
+        Ok(Self { pose, decoded: features.decode(&protocol::Limits::DEFAULT)?, codec, payload_bytes })
+    }
+}
+
+impl Bev {
+    pub(crate) fn new(py: Python<'_>, bev: DecodedBev) -> PyResult<Py<Self>> {
+        let DecodedBev { pose, decoded, codec, payload_bytes } = bev;
+        let protocol::BevFeatures { grid, channels, code_of, values } = decoded.features;
+        let BevGrid { x_min_m, y_min_m, cell_m, width, height } = grid;
+        let [channels, height, width] = [channels, height, width].map(|size| size as usize);
+        let mask = decoded.sent.map(|sent| PyArray1::from_vec(py, sent).reshape([height, width])).transpose()?;
+        let made = Self {
+            features: PyArray1::from_vec(py, values).reshape([channels, height, width])?.unbind(),
+            mask: mask.map(pyo3::Bound::unbind),
+            x_min_m,
+            y_min_m,
+            cell_m,
+            code_of,
+            dtype: json::name(&codec.dtype)?,
+            payload_bytes,
+            pose: PoseEstimate::new(py, &pose)?,
+        };
+        Py::new(py, made)
+    }
+}
+
+#[pymethods]
+impl Bev {
+    fn __repr__(&self, py: Python<'_>) -> String {
+        let shape = self.features.bind(py).readonly().as_array().shape().to_vec();
+        let part = if self.mask.is_some() { ", masked" } else { "" };
+        format!("Bev({shape:?}, cells of {} m, {} bytes of {}{part})", self.cell_m, self.payload_bytes, self.dtype)
+    }
+}
+
+/// Detections of an ego, or of one agent from its own sensors.
+#[pyclass(frozen, get_all, module = "v2vloc")]
+pub(crate) struct Detections {
+    cav: String,
+    boxes: Matrix,
+    scores: Py<PyArray1<f32>>,
+    sources: Py<PyList>,
+    pose: Py<PoseEstimate>,
+    method: Option<String>,
+    agent_frame: Option<u64>,
+    fused: Py<PyAny>,
+    skipped: Py<PyAny>,
+    neighbours: Py<PyAny>,
+    stages_ms: Py<PyDict>,
+}
+
+impl Detections {
+    /// The result of an ego.
+    pub(crate) fn of_ego(py: Python<'_>, found: &protocol::Detections) -> PyResult<Py<Self>> {
+        let protocol::Detections { ego, agent_frame, method, pose, detections, fused, skipped, neighbours, stages } =
+            found;
+        let stages_ms = PyDict::new(py);
+        for timing in stages {
+            stages_ms.set_item(&timing.stage, timing.nanos as f64 * 1e-6)?;
+        }
+        let made = Self {
+            method: Some(method.clone()),
+            agent_frame: Some(*agent_frame),
+            fused: json::to_python(py, fused)?.unbind(),
+            skipped: json::to_python(py, skipped)?.unbind(),
+            neighbours: json::to_python(py, neighbours)?.unbind(),
+            stages_ms: stages_ms.unbind(),
+            ..Self::of_list(py, ego.as_str(), pose, detections)?
+        };
+        Py::new(py, made)
+    }
+
+    /// What one agent finds in its own sensor data.
+    pub(crate) fn of_agent(py: Python<'_>, cav: &str, boxes: &protocol::Boxes) -> PyResult<Py<Self>> {
+        Py::new(py, Self::of_list(py, cav, &boxes.pose, &boxes.detections)?)
+    }
+
+    fn of_list(py: Python<'_>, cav: &str, pose: &protocol::PoseEstimate, found: &[Detection]) -> PyResult<Self> {
+        let sources = found.iter().map(|one| one.source.as_ref().map(ToString::to_string));
+        let empty = || PyList::empty(py).into_any().unbind();
+        Ok(Self {
+            cav: cav.to_owned(),
+            boxes: arrays::boxes(py, found.iter().map(|one| &one.box3d))?,
+            scores: PyArray1::from_vec(py, found.iter().map(|one| one.score).collect()).unbind(),
+            sources: PyList::new(py, sources.collect::<Vec<_>>())?.unbind(),
+            pose: PoseEstimate::new(py, pose)?,
+            method: None,
+            agent_frame: None,
+            fused: empty(),
+            skipped: empty(),
+            neighbours: empty(),
+            stages_ms: PyDict::new(py).unbind(),
+        })
+    }
+
+    /// The arrays from which average precision is computed.
+    pub(crate) fn scored(&self) -> (&Matrix, &Py<PyArray1<f32>>) {
+        (&self.boxes, &self.scores)
+    }
+}
+
+#[pymethods]
+impl Detections {
+    fn __repr__(&self, py: Python<'_>) -> String {
+        let count = self.__len__(py);
+        let method = self.method.as_deref().map_or(String::new(), |method| format!(", method={method:?}"));
+        format!("Detections(cav={:?}, {count} boxes{method})", self.cav)
+    }
+
+    fn __len__(&self, py: Python<'_>) -> usize {
+        numpy::PyUntypedArrayMethods::len(self.scores.bind(py))
+    }
+}
+
+/// Annotated objects.
+#[pyclass(frozen, get_all, module = "v2vloc")]
+pub(crate) struct Objects {
+    ids: Py<PyArray1<i64>>,
+    classes: Py<PyList>,
+    boxes: Option<Matrix>,
+    world_from_object: Py<PyArray3<f64>>,
+    sizes_m: Matrix,
+    speeds_mps: Py<PyArray1<f64>>,
+}
+
+impl Objects {
+    /// The annotation of an agent.
+    pub(crate) fn annotated(py: Python<'_>, frame: &Frame) -> PyResult<Py<Self>> {
+        let objects: Vec<&Object> = frame.objects.iter().collect();
+        let boxes = frame.world_from_lidar.map(|pose| {
+            let lidar_from_world = pose.isometry().inverse();
+            objects.iter().map(|object| upright_box(object, &lidar_from_world)).collect::<Vec<_>>()
+        });
+        Self::new(py, &objects, boxes.as_deref())
+    }
+
+    /// Objects with their boxes in the frame of a LiDAR, if its true pose is known.
+    pub(crate) fn new(py: Python<'_>, objects: &[&Object], boxes: Option<&[Box3d]>) -> PyResult<Py<Self>> {
+        let boxes = boxes.map(|boxes| arrays::boxes(py, boxes.iter()));
+        let poses: Vec<Pose> = objects.iter().map(|object| object.world_from_object).collect();
+        let speeds = objects.iter().map(|object| object.speed_mps.unwrap_or(f64::NAN)).collect();
+        let made = Self {
+            ids: PyArray1::from_vec(py, objects.iter().map(|object| object.id).collect()).unbind(),
+            classes: PyList::new(py, objects.iter().map(|object| object.class.name()))?.unbind(),
+            boxes: boxes.transpose()?,
+            world_from_object: arrays::poses(py, &poses)?,
+            sizes_m: arrays::rows(py, objects.iter().map(|object| object.size_m).collect())?,
+            speeds_mps: PyArray1::from_vec(py, speeds).unbind(),
+        };
+        Py::new(py, made)
+    }
+
+    /// The boxes in the frame of a LiDAR, if its pose is known.
+    pub(crate) fn boxes(&self) -> Option<&Matrix> {
+        self.boxes.as_ref()
+    }
+}
+
+#[pymethods]
+impl Objects {
+    fn __repr__(&self, py: Python<'_>) -> String {
+        format!("Objects({} boxes)", self.__len__(py))
+    }
+
+    fn __len__(&self, py: Python<'_>) -> usize {
+        numpy::PyUntypedArrayMethods::len(self.ids.bind(py))
+    }
+}
+
+/// Image of a camera, encoded, with its calibration.
+#[pyclass(frozen, get_all, module = "v2vloc")]
+pub(crate) struct Camera {
+    image: Py<PyBytes>,
+    format: String,
+    width_px: u32,
+    height_px: u32,
+    intrinsics: Option<Matrix>,
+    lidar_from_camera: Option<Matrix>,
+}
+
+impl Camera {
+    pub(crate) fn new(py: Python<'_>, camera: &protocol::Camera) -> PyResult<Py<Self>> {
+        let CameraMetadata { format, width_px, height_px, pinhole, lidar_from_camera } = camera.metadata;
+        let intrinsics = pinhole.map(|pinhole| {
+            let protocol::Pinhole { fx_px, fy_px, cx_px, cy_px } = pinhole;
+            arrays::rows(py, vec![[fx_px, 0.0, cx_px], [0.0, fy_px, cy_px], [0.0, 0.0, 1.0]])
+        });
+        let made = Self {
+            image: PyBytes::new(py, &camera.image).unbind(),
+            format: format.name().to_owned(),
+            width_px,
+            height_px,
+            intrinsics: intrinsics.transpose()?,
+            lidar_from_camera: lidar_from_camera.map(|pose| arrays::pose(py, &pose)).transpose()?,
+        };
+        Py::new(py, made)
+    }
+}
+
+#[pymethods]
+impl Camera {
+    fn __repr__(&self) -> String {
+        format!("Camera({} x {} pixels, {})", self.width_px, self.height_px, self.format)
+    }
+}

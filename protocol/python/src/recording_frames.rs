@@ -1,0 +1,75 @@
+//! Frames of a recording: its messages by capture time, in any order of access.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use dataset::LoadOptions;
+use dataset::evaluation_protocol::EvaluationProtocol;
+use protocol::{Stream, Topic};
+use recording::{Entry, Recording};
+
+use crate::frame_parts::{FrameParts, is_part_of_frames};
+
+/// A recording, and the messages of each of its frames.
+pub(crate) struct RecordingFrames {
+    recording: Recording,
+    run: String,
+    protocol: EvaluationProtocol,
+    /// Capture times and indices of their messages, in order.
+    frames: Vec<(u64, Vec<usize>)>,
+}
+
+impl RecordingFrames {
+    pub(crate) fn open(
+        path: &Path,
+        options: &LoadOptions,
+        protocol: EvaluationProtocol,
+    ) -> Result<Self, recording::RecordingError> {
+        let recording = Recording::open(path)?;
+        let mut frames: BTreeMap<u64, Vec<usize>> = BTreeMap::new();
+        for (index, Entry { key, header, .. }) in recording.entries().iter().enumerate() {
+            if is_part_of_frames(&key.topic) && is_wanted(&key.topic, options) {
+                frames.entry(header.stamp.capture_nanos).or_default().push(index);
+            }
+        }
+        let run = recording.entries().first().map(|entry| entry.key.run.to_string()).unwrap_or_default();
+        Ok(Self { recording, run, protocol, frames: frames.into_iter().collect() })
+    }
+
+    /// Name of the recorded run.
+    pub(crate) fn run(&self) -> &str {
+        &self.run
+    }
+
+    pub(crate) fn len(&self) -> usize {
+        self.frames.len()
+    }
+
+    /// Parts of the file that cannot be read.
+    pub(crate) fn problems(&self) -> Vec<String> {
+        self.recording.damage().iter().map(ToString::to_string).collect()
+    }
+
+    /// Reads the messages of a frame. One that cannot be read or decoded is left out and named.
+    pub(crate) fn load(&self, index: usize) -> Option<FrameParts> {
+        let (capture_nanos, messages) = self.frames.get(index)?;
+        let mut parts = FrameParts::empty(&self.run, *capture_nanos, &self.protocol);
+        for entry in messages.iter().filter_map(|&index| self.recording.entries().get(index)) {
+            let problem = match self.recording.read(entry) {
+                Ok(bytes) => parts.add(&entry.key.topic, [bytes.as_slice()]).err().map(|cause| cause.to_string()),
+                Err(cause) => Some(cause.to_string()),
+            };
+            parts.problems.extend(problem.map(|cause| format!("{}: {cause}", entry.key)));
+        }
+        Some(parts)
+    }
+}
+
+fn is_wanted(topic: &Topic, options: &LoadOptions) -> bool {
+    match topic {
+        Topic::Stream { stream: Stream::Lidar | Stream::Points, .. } => options.points,
+        Topic::Stream { stream: Stream::Radar, .. } => options.radar,
+        Topic::Stream { stream: Stream::Camera(_), .. } => options.cameras,
+        _ => true,
+    }
+}

@@ -1,0 +1,65 @@
+//! Subscriptions of a listener: key expressions of the streams that are asked for and permitted.
+
+use protocol::{KeyExpr, Operation, Principal, RunId, RunScope, Stream};
+use pyo3::{PyErr, PyResult};
+
+use crate::error::error;
+
+/// Streams of a listener that asks for none: all but sweeps and images, which are most of the traffic.
+const STREAMS: [&str; 8] = ["gnss", "imu", "pose", "bev", "boxes", "points", "detections", "truth"];
+
+/// Key expressions that a listener may subscribe to.
+pub(crate) enum Access {
+    /// A run without access control.
+    All,
+    /// Those of a principal.
+    Of(Principal, Vec<KeyExpr>),
+}
+
+impl Access {
+    /// What a certificate permits in a run.
+    pub(crate) fn of(principal: &Principal, run: &RunId) -> Self {
+        let rights = principal.rights(&RunScope::One(run.clone())).into_iter();
+        let subscribed = rights.filter(|right| right.act == Operation::Subscribe).map(|right| right.keys);
+        Self::Of(principal.clone(), subscribed.collect())
+    }
+
+    fn permits(&self, run: &RunId, wanted: &KeyExpr) -> bool {
+        match self {
+            Self::All => true,
+            Self::Of(_, permitted) => permitted.iter().any(|keys| keys == wanted || *keys == KeyExpr::run(run)),
+        }
+    }
+}
+
+/// Key expressions of the streams, and of the end of the run. Without names: those of [`STREAMS`] that are permitted.
+pub(crate) fn selectors(run: &RunId, names: Option<Vec<String>>, access: &Access) -> PyResult<Vec<KeyExpr>> {
+    let mut selectors = vec![KeyExpr::control(run)];
+    let is_choice = names.is_some();
+    for name in names.unwrap_or_else(|| STREAMS.map(str::to_owned).into()) {
+        let wanted = selector(run, &name)?;
+        match access {
+            _ if access.permits(run, &wanted) => selectors.push(wanted),
+            Access::Of(principal, _) if is_choice => {
+                return Err(error(format!("streams: a certificate of {principal} does not permit {name:?}")));
+            }
+            _ => {}
+        }
+    }
+    selectors.retain(|wanted| access.permits(run, wanted));
+    Ok(selectors)
+}
+
+fn selector(run: &RunId, name: &str) -> PyResult<KeyExpr> {
+    Ok(match name {
+        "truth" => KeyExpr::truth(run),
+        "camera" => KeyExpr::cameras(run),
+        "stats" => KeyExpr::stats(run),
+        name => KeyExpr::stream(run, name.parse::<Stream>().map_err(|_| no_stream(name))?),
+    })
+}
+
+fn no_stream(name: &str) -> PyErr {
+    let known = "lidar, radar, camera, gnss, imu, pose, bev, boxes, points, detections, descriptor, pace, truth, stats";
+    error(format!("streams: {name:?} is none; there are {known}"))
+}

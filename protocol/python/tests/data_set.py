@@ -1,0 +1,102 @@
+"""Data sets on disk and recordings."""
+import pickle
+
+import numpy as np
+import v2vloc
+
+from fleet import FRAMES
+
+
+def test_a_generated_scene_has_clouds_poses_and_boxes(run):
+    scene = v2vloc.read(run.scene)
+    assert len(scene) == FRAMES and not scene.problems and len(scene.scenarios) == 1, scene
+    assert scene[-1].tick == FRAMES - 1 == [frame.tick for frame in scene][-1]
+    frame = scene[0]
+    assert list(frame.agents)[0] == frame.ego and len(frame.agents) == 2, frame
+    agent = frame.agents[frame.ego]
+    assert agent.points.dtype == np.float32 and agent.points.shape[1] == 4 and len(agent.points) > 1000
+    assert agent.world_from_lidar.dtype == np.float64
+    np.testing.assert_allclose(agent.world_from_lidar[:3, :3] @ agent.world_from_lidar[:3, :3].T, np.eye(3), atol=1e-9)
+    assert len(agent.objects) == len(agent.objects.ids) == len(agent.objects.classes) > 0
+    assert agent.objects.boxes.shape == (len(agent.objects), 7)
+    assert agent.pose is None and agent.bev is None and not frame.detections
+
+
+def test_boxes_are_where_their_poses_are(run):
+    agent = next(iter(v2vloc.read(run.scene, points=False)[0].agents.values()))
+    lidar_from_object = np.linalg.inv(agent.world_from_lidar) @ agent.objects.world_from_object
+    np.testing.assert_allclose(lidar_from_object[:, :3, 3], agent.objects.boxes[:, :3], atol=1e-6)
+    assert agent.points is None
+
+
+def test_ground_truth_merges_the_agents(run):
+    frame = v2vloc.read(run.scene, points=False)[0]
+    truth = frame.ground_truth()
+    assert len(set(truth.ids)) == len(truth) > 0
+    assert len(frame.ground_truth(area_m=(-10, -10, -3, 10, 10, 1))) < len(truth)
+    other = list(frame.agents)[1]
+    assert len(frame.ground_truth(other)) > 0
+    for arguments, text in [({"protocol": "x"}, "unknown protocol"), ({"ego": "7"}, "no true pose of agent \"7\"")]:
+        refuses(lambda: frame.ground_truth(**arguments), text)
+
+
+def test_a_copy_opens_the_scene_again(run):
+    scene = v2vloc.read(run.scene, points=False)
+    copy = pickle.loads(pickle.dumps(scene))
+    assert len(copy) == len(scene) and copy[1].agents.keys() == scene[1].agents.keys()
+    assert next(iter(copy[1].agents.values())).points is None
+
+
+def test_a_recording_has_the_frames_of_the_live_run(run):
+    assert len(run.recording) == FRAMES, run.recording
+    live = {frame.capture_time_ns: frame for frame in run.live}
+    for frame in run.recording:
+        assert not frame.problems and frame.ego in frame.detections, frame
+        same = live[frame.capture_time_ns]
+        assert frame.tick == same.tick and frame.agents.keys() == same.agents.keys()
+        for cav, agent in frame.agents.items():
+            assert agent.points is not None and same.agents[cav].points is None
+            np.testing.assert_array_equal(agent.bev.features, same.agents[cav].bev.features)
+            np.testing.assert_array_equal(agent.pose.world_from_cav, same.agents[cav].pose.world_from_cav)
+        np.testing.assert_array_equal(frame.detections[frame.ego].boxes, same.detections[frame.ego].boxes)
+
+
+def test_a_truncated_recording_is_read_up_to_its_end(run):
+    whole = (run.work / "runs/fleet/recording.mcap").read_bytes()
+    cut = run.work / "cut.mcap"
+    cut.write_bytes(whole[: len(whole) * 2 // 3])
+    data_set = v2vloc.read(cut)
+    assert 0 < len(data_set) <= FRAMES and "bytes from byte" in data_set.problems[0], data_set.problems
+
+
+def test_a_damaged_frame_keeps_its_other_parts(run):
+    points = sorted(run.scene.rglob("*.pcd"))[0]
+    whole = points.read_bytes()
+    points.write_bytes(whole[:200])
+    try:
+        frame = v2vloc.read(run.scene)[0]
+        assert len(frame.agents) == 1 and points.name in frame.problems[0], frame.problems
+    finally:
+        points.write_bytes(whole)
+
+
+def test_what_cannot_be_opened_is_named(run):
+    refuses(lambda: v2vloc.read(run.work / "nowhere"), "nowhere")
+    empty = run.work / "empty"
+    empty.mkdir()
+    refuses(lambda: v2vloc.read(empty), "no supported layout")
+    try:
+        v2vloc.read(run.scene)[FRAMES]
+    except IndexError as error:
+        assert f"frame {FRAMES} of {FRAMES}" in str(error)
+    else:
+        raise AssertionError("no IndexError")
+
+
+def refuses(action, text):
+    try:
+        action()
+    except v2vloc.Error as error:
+        assert isinstance(error, ValueError) and text in str(error), error
+    else:
+        raise AssertionError(f"no error with {text!r}")
