@@ -79,6 +79,11 @@ OVERLAPS = """(() => { const nodes = [...document.querySelectorAll(".tools, .leg
 IMAGE_WIDTH = 96
 IMAGES = "[...document.querySelectorAll('#images img')].map((image) => image.naturalWidth)"
 
+# Words for a status of the server.
+STATE_OF = """(async () => { const real = fetch; window.fetch = async () => new Response(%s);
+  try { await check(); } finally { window.fetch = real; }
+  return document.getElementById("state").textContent; })()"""
+
 
 def text(selector: str) -> str:
     return f"document.querySelector({json.dumps(selector)}).textContent"
@@ -320,6 +325,9 @@ class LivePage(Checks):
         self.none("every colour of the scene is in the legend", self.tab.value(UNEXPLAINED))
         self.images(20)
         self.tab.screenshot(pictures("live"))
+        for has_router, words in ((True, "last message 4 s ago"), (False, "router gone, last message 4 s ago")):
+            status = {"silent_s": 4.2, "is_over": False, "has_router": has_router}
+            self.same("a run that has fallen silent", self.tab.value(STATE_OF % json.dumps(json.dumps(status))), words)
 
     def ends(self, pictures) -> None:
         self.becomes("says that the run has ended", "#state", "^ended \\d+(\\.\\d)? s ago$", 8)
@@ -327,7 +335,7 @@ class LivePage(Checks):
         self.tab.screenshot(pictures("ended"))
 
     def loses_router(self, pictures) -> None:
-        self.becomes("says that the router is gone", "#state", "router gone", 15)
+        self.becomes("says that the router is gone", "#state", "^ended \\d+(\\.\\d)? \\w+ ago, router gone$", 15)
         self.layout()
         self.tab.screenshot(pictures("router-gone"))
         self.quiet()
