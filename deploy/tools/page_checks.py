@@ -188,6 +188,8 @@ class RecordedPage(Checks):
         self.none("every colour of the scene is in the legend", self.tab.value(UNEXPLAINED))
         self.layout()
         self.tab.screenshot(pictures("recorded"))
+        self.tab.dark(True)
+        self.tab.screenshot(pictures("recorded-dark"))
         self.quiet()
 
     def navigation(self) -> None:

@@ -41,7 +41,9 @@ pub fn serve_live(address: SocketAddr, run: Arc<LiveRun>) -> io::Result<WebServe
         "/status" => document(&json!(run.status())),
         path => match camera(path) {
             Some((cav, number)) => match run.images().get(&cav, number) {
-                None => Answer::Page { content_type: "image/svg+xml", body: Bytes::from_static(NO_IMAGE_YET.as_bytes()) },
+                None => {
+                    Answer::Page { content_type: "image/svg+xml", body: Bytes::from_static(NO_IMAGE_YET.as_bytes()) }
+                }
                 found => image(found),
             },
             None => asset(request),

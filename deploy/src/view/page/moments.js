@@ -52,7 +52,7 @@ async function check() {
   if (!answer || !answer.ok) return;
   const { silent_s: silent, is_over: over, has_router: router } = await answer.json();
   const before = isKnown(silent) ? ` ${seconds(silent)} ago` : "";
-  if (over && silent > 2) state("ended", `ended${before}${router ? "" : ", router gone"}`);
+  if (over && silent > 2) state("over", `ended${before}${router ? "" : ", router gone"}`);
   else if (!router) state("ended", before ? `router gone, last message${before}` : "router gone");
   else if (!isKnown(silent)) state("waiting", "waiting for the run");
   else if (silent > 3) state("ended", `last message${before}`);
