@@ -290,6 +290,13 @@ fn a_live_run_is_shown_and_a_slow_page_delays_no_other() {
     assert_eq!(moments_of(server.address(), 3).len(), 3);
     wait_for("it is dropped", || server.readers().dropped() == 1);
     wait_for("and no watcher any more", || run.watchers() == 0);
+
+    // Reports of processes, also those of this viewer, do not make a silent run a live one.
+    let mut open = TcpStream::connect(server.address()).unwrap();
+    open.write_all(b"GET /live HTTP/1.1\r\n\r\n").unwrap();
+    wait_for("it is watched", || run.status().silent_s.is_some_and(|silent_s| silent_s < 0.5));
+    traffic.ending.store(true, Ordering::Relaxed);
+    wait_for("the run is silent", || run.status().silent_s.is_some_and(|silent_s| silent_s > 1.5));
 }
 
 /// `count` moments of a live run.
