@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use localization::pgc::{SceneHead, SceneHeadConfig};
 use perception::weights::{Weights, WeightsError};
+use support::shared_files;
 
 /// Ending of weights files.
 const ENDING: &str = "safetensors";
@@ -11,10 +12,8 @@ const ENDING: &str = "safetensors";
 pub const ENCODER_FILE: &str = "pgc-encoder.safetensors";
 /// Name of the weights in the folder of a training.
 const TRAINED_FILE: &str = "weights.safetensors";
-/// Folders of released weights: from the working directory, and from the folder of the programs (a checkout's
-/// `target/release`, or `bin` of an installation).
+/// Folders of released weights from the working directory.
 const FROM_HERE: [&str; 2] = ["deploy/weights", "weights"];
-const FROM_PROGRAMS: [&str; 3] = ["../share/v2vloc/weights", "../../deploy/weights", "../weights"];
 
 /// Reasons why no file is chosen.
 #[derive(Debug, thiserror::Error)]
@@ -94,9 +93,8 @@ pub fn released_encoder() -> Option<PathBuf> {
 
 /// Folders of released weights that exist.
 fn weights_folders() -> Vec<PathBuf> {
-    let programs = std::env::current_exe().ok().and_then(|exe| exe.parent().map(Path::to_owned));
-    let installed = programs.into_iter().flat_map(|folder| FROM_PROGRAMS.map(|name| folder.join(name)));
-    FROM_HERE.into_iter().map(PathBuf::from).chain(installed).filter(|folder| folder.is_dir()).collect()
+    let here = FROM_HERE.into_iter().map(PathBuf::from).filter(|folder| folder.is_dir());
+    here.chain(shared_files::shared("weights")).collect()
 }
 
 /// Weights in a folder, in text order.

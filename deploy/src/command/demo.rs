@@ -1,5 +1,6 @@
 //! `v2vloc demo`.
 
+use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::time::Instant;
 
@@ -13,21 +14,23 @@ use protocol::RunId;
 use simulator::generate::{self, Subset, SynthError, SynthOptions};
 use support::output;
 use support::progress;
+use support::shared_files;
 
 use super::programs;
+use super::view::show;
 use support::cli::BadInput;
 use support::cli::Outcome;
 
 /// Seeds from here on are never trained with.
 const SEED: u64 = 1000;
-/// The scenario of the demo, in the checkout that this program was built from.
-const SCENARIO: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/scenarios/demo.yaml");
+/// The scenario of the demo, among the files that come with the programs.
+const SCENARIO: &str = "scenarios/demo.yaml";
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct Arguments {
-    /// The scenario to run on the generated scene.
-    #[arg(long, default_value = SCENARIO, hide_default_value = true)]
-    scenario: PathBuf,
+    /// The scenario to run on the generated scene [default: demo.yaml, which comes with the programs].
+    #[arg(long, value_name = "FILE")]
+    scenario: Option<PathBuf>,
     /// Folder of the generated scenes; an existing scene is used again.
     #[arg(long, default_value = "scenes")]
     scenes: PathBuf,
@@ -52,6 +55,12 @@ pub(crate) struct Arguments {
     /// Seconds of the scene per second: below 1 slower, for machines that do not keep up.
     #[arg(long, value_name = "TIMES", default_value_t = 1.0)]
     rate: f64,
+    /// Record the last method's run and show it in a browser afterwards, until Ctrl-C.
+    #[arg(long)]
+    view: bool,
+    /// Address of the page (--view).
+    #[arg(long, value_name = "HOST:PORT", default_value = "127.0.0.1:8088", requires = "view")]
+    listen: SocketAddr,
     /// Print the metrics of the last method's run as JSON instead of a table of all.
     #[arg(long)]
     json: bool,
@@ -60,7 +69,8 @@ pub(crate) struct Arguments {
 impl Arguments {
     /// Generates the scene, runs the methods and prints their metrics.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
-        let mut scenario = Scenario::read(&self.scenario)?;
+        let file = self.scenario()?;
+        let mut scenario = Scenario::read(&file)?;
         scenario.scene.dir = self.scene()?;
         scenario.scene.rate = self.rate;
         let name = self.name.clone().unwrap_or_else(|| name_of_now("demo"));
@@ -68,7 +78,10 @@ impl Arguments {
         for &method in &self.methods {
             scenario.method = method;
             scenario.run = Some(RunId::new(&format!("{name}-{method}")).map_err(BadInput::of)?);
-            scenario.check(&self.scenario)?;
+            if self.view && Some(&method) == self.methods.last() {
+                scenario.record.get_or_insert_default();
+            }
+            scenario.check(&file)?;
             let options = RunOptions { runs: self.runs.clone(), programs: programs()?, prefix: "demo" };
             let result = run_scenario(&scenario, &options).with_context(|| format!("method {method}"))?;
             if !self.json {
@@ -82,7 +95,16 @@ impl Arguments {
         }
         self.print(&results)?;
         results.iter().for_each(|result| report::print_loss(result, results.len() > 1));
+        if let Some(last) = results.last().filter(|last| self.view && !last.interrupted) {
+            show(&last.folder.file("recording.mcap"), self.listen)?;
+        }
         Ok(Outcome::of(results.iter().any(RunResult::lost_data)))
+    }
+
+    fn scenario(&self) -> Result<PathBuf, BadInput> {
+        let shared = || shared_files::shared(SCENARIO).into_iter().next();
+        let none = || BadInput::new(format!("{SCENARIO} is not beside the programs: name a file by --scenario"));
+        self.scenario.clone().or_else(shared).ok_or_else(none)
     }
 
     /// Folder of the scene, which is generated if it does not exist.

@@ -35,7 +35,7 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "DIR", required_unless_present = "table")]
     dataset: Option<PathBuf>,
     /// Fusion methods, as `ego-fuser methods` lists them; several give one table.
-    #[arg(long, value_name = "NAME", value_delimiter = ',', required_unless_present = "table")]
+    #[arg(long, value_name = "NAME", num_args = 1.., value_delimiter = ',', required_unless_present = "table")]
     method: Vec<Method>,
     /// Weights of the detector; or a folder with *-METHOD.safetensors or METHOD/weights.safetensors for each method; or
     /// the folder of a training.

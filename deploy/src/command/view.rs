@@ -1,7 +1,7 @@
 //! `v2vloc view`.
 
 use std::net::SocketAddr;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -47,30 +47,42 @@ pub(crate) struct Arguments {
 impl Arguments {
     /// Serves the page until Ctrl-C.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
-        let stop = Stop::new();
-        stop.on_signals()?;
-        let server = match self.shown()? {
-            Shown::Recorded(path) => {
-                let run = RecordedRun::open(&path).map_err(|error| match error {
-                    ViewError::NotRecorded(_) | ViewError::Empty(_) => anyhow::Error::from(BadInput::of(error)),
-                    ViewError::Recording(_) => anyhow::Error::from(error),
-                })?;
-                output::note(format_args!("{} moments of run {}", run.len(), run.name()));
-                serve_recorded(self.listen, Arc::new(run))
-            }
+        match self.shown()? {
+            Shown::Recorded(path) => show(&path, self.listen)?,
             Shown::Live(name, router) => {
                 // On the machine of the run, the run has priority.
                 let _ = rustix::process::nice(VIEWER_NICENESS);
                 let bus = viewer_bus(&name, &router, self.keys.as_deref())?;
-                serve_live(self.listen, Arc::new(LiveRun::start(bus)?))
+                let run = Arc::new(LiveRun::start(bus)?);
+                until_stopped(self.listen, |address| serve_live(address, run))?;
             }
-        };
-        let server = server.map_err(|error| BadInput::new(format!("cannot serve at {}: {error}", self.listen)))?;
-        output::note(format_args!("http://{}/ (Ctrl-C ends it)", server.address()));
-        while !stop.wait_until(Instant::now() + Duration::from_secs(3600)) {}
-        warn_dropped(&server);
+        }
         Ok(Outcome::Done)
     }
+}
+
+/// Shows a recording until Ctrl-C.
+pub(super) fn show(recording: &Path, listen: SocketAddr) -> anyhow::Result<()> {
+    let run = RecordedRun::open(recording).map_err(|error| match error {
+        ViewError::NotRecorded(_) | ViewError::Empty(_) => anyhow::Error::from(BadInput::of(error)),
+        ViewError::Recording(_) => anyhow::Error::from(error),
+    })?;
+    output::note(format_args!("{} moments of run {}", run.len(), run.name()));
+    until_stopped(listen, |address| serve_recorded(address, Arc::new(run)))
+}
+
+/// Serves a page until Ctrl-C.
+fn until_stopped(
+    listen: SocketAddr,
+    serve: impl FnOnce(SocketAddr) -> std::io::Result<WebServer>,
+) -> anyhow::Result<()> {
+    let stop = Stop::new();
+    stop.on_signals()?;
+    let server = serve(listen).map_err(|error| BadInput::new(format!("cannot serve at {listen}: {error}")))?;
+    output::note(format_args!("http://{}/ (Ctrl-C ends it)", server.address()));
+    while !stop.wait_until(Instant::now() + Duration::from_secs(3600)) {}
+    warn_dropped(&server);
+    Ok(())
 }
 
 /// The run that is shown.

@@ -13,7 +13,8 @@ use dataset::{self, OpenOptions};
 use fusion::Exchange;
 use fusion::Method;
 use link::LinkEmulator;
-use localization::competitors::EndToEndLocalizer;
+use localization::competitors::load_competitor;
+use localization::pgc::pose_solver::PoseSolver;
 use localization::pgc::{Localizer, LocalizerError};
 use localization::pose_source::{PgcConfig, PoseSourceConfig, TrackedPoseConfig};
 use perception::inference::Inference;
@@ -212,7 +213,9 @@ fn load_networks(pose: &PoseSourceConfig) -> Result<(), LocalizerError> {
         | PoseSourceConfig::Tracked(TrackedPoseConfig { encoder, head, .. }) => {
             Localizer::load(encoder, head, Inference::default()).map(drop)
         }
-        PoseSourceConfig::EndToEnd(network) => EndToEndLocalizer::load(&network.weights, Device::Cpu).map(drop),
+        PoseSourceConfig::EndToEnd(network) => {
+            load_competitor(&network.weights, Device::Cpu, PoseSolver::default()).map(drop)
+        }
         PoseSourceConfig::Recorded | PoseSourceConfig::Noisy(_) | PoseSourceConfig::Cached(_) => Ok(()),
     }
 }

@@ -7,7 +7,7 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use bus::shutdown::Stop;
-use bus::{Endpoint, Rejection};
+use bus::{Endpoint, MetricsPeer, Rejection};
 use protocol::{Ledger, Reconciliation, RunId};
 use support::output;
 
@@ -141,7 +141,8 @@ fn go(fleet: &Fleet, options: &RunOptions, run: &RunId, folder: &RunFolder) -> R
     let files = LINES.map(|name| folder.file(name));
     let mut scorer = ScorerNode::start(place.session.clone(), run, &fleet.agents, &fleet.ego, board, files)?;
     if let Some(address) = fleet.scenario.network.metrics {
-        scorer.serve_metrics(address)?;
+        let peer = |spec: &ProcessSpec| Some(MetricsPeer { process: spec.name.clone(), address: spec.metrics? });
+        scorer.serve_metrics(address, specs.iter().filter_map(peer).collect())?;
     }
     let watched = watch(fleet, &context, specs, &place.endpoint, &scorer, &stop);
     // Before the scorer closes the session.
@@ -197,10 +198,8 @@ fn watch(
     let SessionContext { run, folder, .. } = *context;
     let (events, happened) = channel();
     let mut display = Display::new(fleet.ticks);
-    for ProcessSpec { name, metrics, .. } in &specs {
-        if let Some(address) = metrics {
-            display.print_line(&format!("metrics of {name} at http://{address}/metrics"));
-        }
+    if let Some(address) = fleet.scenario.network.metrics {
+        display.print_line(&format!("metrics of all processes at http://{address}/metrics"));
     }
     let restarts = fleet.scenario.timeouts.restarts;
     display.print_line(&format!(

@@ -1,13 +1,17 @@
 //! Scorer process on the bus: receives truth, detections, poses and the ledgers of all processes, and keeps the scores.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use bus::bounded_queue::Pop;
-use bus::{Arrival, Bus, BusError, Event, Identity, Inbox, LivelinessToken, Subscription, process_id, process_usage};
+use bus::{
+    Arrival, Bus, BusError, Event, Identity, Inbox, LivelinessToken, MetricsPeer, Subscription, process_id,
+    process_usage,
+};
 use protocol::{
     CavId, Detections, DetectionsReport, KeyExpr, Ledger, Limits, NeighbourState, PoseEstimate, ProcessId,
     ProcessUsage, Role, RunId, StageSummary, Stats, Stream, Topic, TopicTraffic, Truth,
@@ -173,12 +177,12 @@ impl ScorerNode {
         Ok(Self { bus, inbox, progress, thread, offline, _subscriptions: subscriptions, _presence: presence })
     }
 
-    /// Serves the scorer's own counters to Prometheus.
+    /// Serves the counters of the scorer and of the others to Prometheus.
     ///
     /// # Errors
     /// [`ScorerError::Bus`] when the address cannot be listened at.
-    pub(crate) fn serve_metrics(&mut self, address: std::net::SocketAddr) -> Result<(), ScorerError> {
-        self.bus.serve_metrics(address)?;
+    pub(crate) fn serve_metrics(&mut self, address: SocketAddr, others: Vec<MetricsPeer>) -> Result<(), ScorerError> {
+        self.bus.serve_metrics(address, others)?;
         Ok(())
     }
 

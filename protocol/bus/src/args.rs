@@ -123,7 +123,7 @@ impl BusConfig {
         }
         let mut bus = Bus::join(&options, identity)?;
         if let Some(address) = self.metrics {
-            let address = bus.serve_metrics(address)?;
+            let address = bus.serve_metrics(address, Vec::new())?;
             tracing::info!("metrics at http://{address}/metrics");
         }
         Ok(bus)

@@ -13,7 +13,7 @@ use zenoh::{Session, Wait};
 use super::flush_barrier::FlushBarrier;
 use super::inbox_limits::InboxLimits;
 use super::liveliness::{LivelinessEvent, LivelinessSubscription, LivelinessToken};
-use super::metrics::MetricsServer;
+use super::metrics::{MetricsPeer, MetricsServer};
 use super::passive_subscriber::PassiveSubscriber;
 use super::publisher::{Publisher, PublisherOptions, unix_nanos};
 use super::shared_pool::SharedPool;
@@ -74,13 +74,13 @@ impl Bus {
         Ok(Self { session, identity, epoch, stats, pool, status, status_thread, metrics: None })
     }
 
-    /// Serves the counters to Prometheus until this is dropped; returns the address.
+    /// Serves the counters, and those of other processes, to Prometheus until this is dropped; returns the address.
     ///
     /// # Errors
     /// [`BusError::Metrics`] when the address cannot be bound.
-    pub fn serve_metrics(&mut self, address: SocketAddr) -> Result<SocketAddr, BusError> {
-        let server =
-            MetricsServer::start(address, &self.stats).map_err(|cause| BusError::Metrics { address, cause })?;
+    pub fn serve_metrics(&mut self, address: SocketAddr, others: Vec<MetricsPeer>) -> Result<SocketAddr, BusError> {
+        let server = MetricsServer::start(address, &self.stats, others);
+        let server = server.map_err(|cause| BusError::Metrics { address, cause })?;
         Ok(self.metrics.insert(server).address())
     }
 

@@ -1,5 +1,7 @@
 //! Metrics endpoint: message counters, frames from end to end, stage durations and resources for Prometheus.
 
+mod fleet;
+
 use std::borrow::Cow;
 use std::fmt;
 use std::net::SocketAddr;
@@ -11,6 +13,8 @@ use prometheus_client::metrics::counter::ConstCounter;
 use prometheus_client::metrics::gauge::ConstGauge;
 use prometheus_client::registry::{Registry, Unit};
 
+pub use fleet::MetricsPeer;
+
 use super::{FrameStats, MessageStats, process_usage};
 use crate::web::{Answer, WebServer};
 
@@ -18,14 +22,18 @@ use crate::web::{Answer, WebServer};
 pub(crate) struct MetricsServer(WebServer);
 
 impl MetricsServer {
-    /// Starts to serve `stats`; port 0: any free port.
+    /// Starts to serve `stats`, and the series of `others`; port 0: any free port.
     ///
     /// # Errors
     /// When the address cannot be bound.
-    pub(crate) fn start(address: SocketAddr, stats: &MessageStats) -> std::io::Result<Self> {
+    pub(crate) fn start(address: SocketAddr, stats: &MessageStats, others: Vec<MetricsPeer>) -> std::io::Result<Self> {
         let stats = stats.clone();
         let server = WebServer::start(address, move |request| match request.path.as_str() {
-            "/metrics" => Answer::Page { content_type: CONTENT_TYPE, body: exposition(&stats).into() },
+            "/metrics" => {
+                let own = exposition(&stats);
+                let body = if others.is_empty() { own } else { fleet::fleet_exposition(&own, &others) };
+                Answer::Page { content_type: CONTENT_TYPE, body: body.into() }
+            }
             other => Answer::NotFound(format!("{other} not found; see /metrics")),
         })?;
         Ok(Self(server))
@@ -272,7 +280,7 @@ mod tests {
 
     #[test]
     fn metrics_can_be_fetched() {
-        let server = MetricsServer::start("127.0.0.1:0".parse().unwrap(), &sample()).unwrap();
+        let server = MetricsServer::start("127.0.0.1:0".parse().unwrap(), &sample(), Vec::new()).unwrap();
         let (status, body) = crate::web::fetch(server.address(), "/metrics").unwrap();
         assert_eq!(status, "HTTP/1.0 200 OK");
         let text = String::from_utf8(body).unwrap();

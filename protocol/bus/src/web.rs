@@ -249,8 +249,13 @@ fn respond(status: StatusCode, content_type: &'static str, body: Body) -> Respon
 /// # Errors
 /// When the server cannot be reached or does not answer within 5 s.
 pub fn fetch(address: SocketAddr, path: &str) -> io::Result<(String, Vec<u8>)> {
-    let mut connection = std::net::TcpStream::connect(address)?;
-    connection.set_read_timeout(Some(READ_LIMIT))?;
+    fetch_within(address, path, READ_LIMIT)
+}
+
+/// [`fetch`] with a limit of each wait.
+pub(crate) fn fetch_within(address: SocketAddr, path: &str, limit: Duration) -> io::Result<(String, Vec<u8>)> {
+    let mut connection = std::net::TcpStream::connect_timeout(&address, limit)?;
+    connection.set_read_timeout(Some(limit))?;
     // HTTP/1.0 gives a body in one piece that ends with the connection.
     write!(connection, "GET {path} HTTP/1.0\r\n\r\n")?;
     let mut answer = Vec::new();

@@ -1,6 +1,7 @@
 //! Program support: common functions of all programs that no crate of the field offers.
 //!
-//! - [`cli`]: errors and exit codes; [`sibling_program`]: subcommands that another program executes.
+//! - [`cli`]: errors and exit codes; [`sibling_program`]: subcommands that another program executes; [`shared_files`]: files
+//!   that come with the programs.
 //! - [`output`], [`progress`], [`text_table`]: standard output and error, progress bars, tables.
 //! - [`bounded_file`], [`atomic_file`], [`csv_file`]: reads with a limit on their size, atomic writes, CSV.
 //! - [`statistics`], [`stage_times`], [`nanos`]: quantiles and correlations, the stopwatch, durations in nanoseconds.
@@ -29,6 +30,7 @@ pub mod output;
 pub mod progress;
 pub mod random;
 pub mod rounding;
+pub mod shared_files;
 pub mod sibling_program;
 pub mod stage_times;
 pub mod statistics;

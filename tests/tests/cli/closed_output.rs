@@ -48,7 +48,7 @@ fn every_program_comes_to_its_quiet_end() {
 fn an_error_without_a_reader_keeps_its_exit_code() {
     for (program, arguments, code) in [
         ("sim-replay", ["recover", "/no/recording.mcap", "--out=/no/whole.mcap"], 2),
-        ("ego-fuser", ["eval", "--weights=/no/weights.safetensors", "--data=/no/scene"], 2),
+        ("ego-fuser", ["eval", "--weights=/no/weights.safetensors", "--dataset=/no/scene"], 2),
         ("v2vloc", ["status", "/no/run", "--json"], 2),
     ] {
         assert_eq!(code_unread(program, &arguments, true), Some(code), "{program} {arguments:?}");

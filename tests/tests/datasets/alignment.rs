@@ -153,7 +153,7 @@ fn the_command_compares_recorded_vehicles() {
     let scene = scene.to_str().unwrap();
     let named = format!("noisy={}", source.display());
     let (code, stdout, error) = run(&[
-        "--data",
+        "--dataset",
         scene,
         "--boxes",
         "annotated",
@@ -171,14 +171,14 @@ fn the_command_compares_recorded_vehicles() {
     assert_eq!(of("noisy")["success_1m"], 1.0, "{stdout}");
     assert!(of("icp-gnss")["log2_bytes"].as_f64().unwrap() > 14.0, "{stdout}");
 
-    let (code, _, error) = run(&["--data", scene, "--method", "free-align"]);
+    let (code, _, error) = run(&["--dataset", scene, "--method", "free-align"]);
     assert_eq!(code, Some(2), "{error}");
     assert!(error.contains("--weights"), "{error}");
-    let (code, _, error) = run(&["--data", scene, "--method", "icp-map", "--boxes", "annotated"]);
+    let (code, _, error) = run(&["--dataset", scene, "--method", "icp-map", "--boxes", "annotated"]);
     assert!(code == Some(2) && error.contains("--map"), "{error}");
-    let (code, _, error) = run(&["--data", folder.path().join("none").to_str().unwrap(), "--boxes", "annotated"]);
+    let (code, _, error) = run(&["--dataset", folder.path().join("none").to_str().unwrap(), "--boxes", "annotated"]);
     assert!(code == Some(2) && error.contains("none"), "{error}");
-    let (code, table, error) = run(&["--data", scene, "--boxes", "annotated", "--method", "gnss", "box-icp"]);
+    let (code, table, error) = run(&["--dataset", scene, "--boxes", "annotated", "--method", "gnss", "box-icp"]);
     assert_eq!(code, Some(0), "{error}");
     assert!(table.starts_with("| method | time, s |") && table.contains("| box-icp |"), "{table}");
 }

@@ -141,6 +141,13 @@ fn prometheus_gets_latency_answered_ticks_fused_neighbours_and_resources() {
         std::thread::sleep(std::time::Duration::from_millis(50));
     };
     assert!(value(&text, "v2vloc_ticks_total") >= value(&text, "v2vloc_answered_ticks_total"), "{text}");
+    let answer = text.lines().filter(|line| line.starts_with("v2vloc_process_up{") && line.ends_with(" 1")).count();
+    assert!(answer >= 3, "agents, ego and replay are served at one address\n{text}");
+    assert_eq!(text.matches("# TYPE v2vloc_stage_seconds").count(), 1, "{text}");
+    let board = fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/../deploy/monitoring/grafana.json")).unwrap();
+    for series in ["v2vloc_published_bytes", "v2vloc_stage_seconds", "v2vloc_process_up", "process_cpu_seconds"] {
+        assert!(board.contains(series) && text.contains(series), "{series}\n{text}");
+    }
     for name in [
         "v2vloc_capture_to_detection_seconds_count",
         "v2vloc_capture_to_detection_seconds_sum",

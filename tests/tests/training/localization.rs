@@ -4,11 +4,14 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use agent_offline::training::{
-    EncoderReport, EncoderStart, EncoderTrainConfig, EndToEndReport, EndToEndTrainConfig, LocalizerTrainError,
-    RedundancyConfig, SceneReport, SceneTrainConfig, SweepAugmentation, train_encoder, train_end_to_end, train_scene,
+    DiffLocReport, DiffLocTrainConfig, EncoderReport, EncoderStart, EncoderTrainConfig, EndToEndReport,
+    EndToEndTrainConfig, LocalizerTrainError, RedundancyConfig, SceneReport, SceneTrainConfig, SweepAugmentation,
+    train_diffloc, train_encoder, train_end_to_end, train_scene,
 };
 use dataset::{self, LoadOptions};
-use localization::competitors::{EndToEndKind, EndToEndLocalizer};
+use localization::competitors::diffloc::{DiffLocConfig, RangeImageConfig};
+use localization::competitors::{EndToEndKind, EndToEndLocalizer, load_competitor};
+use localization::pgc::pose_solver::PoseSolver;
 use localization::pgc::{Localizer, LocalizerError, SceneEncoder};
 use perception::inference::Inference;
 use perception::train::{Length, RunConfig, TrainingError};
@@ -176,6 +179,56 @@ fn competitors_learn_on_the_features_of_an_encoder_that_stays_as_it_is() {
         resumed.run.resume = true;
         assert_eq!(train_end_to_end(&resumed, &mut |_| ()).unwrap().steps, steps + 10);
     }
+}
+
+#[test]
+fn diffloc_learns_where_sweeps_were_taken() {
+    let _generator = random_generator_lock();
+    let dir = tempfile::tempdir().unwrap();
+    let scenes = drives(dir.path());
+    let config = |steps| DiffLocTrainConfig {
+        scenes: vec![scenes.clone()],
+        validation: vec![scenes.clone()],
+        network: DiffLocConfig {
+            image: RangeImageConfig { rows: 8, columns: 64, ..RangeImageConfig::default() },
+            patch: [2, 8],
+            stem: [4, 8],
+            width: 32,
+            heads: 2,
+            layers: 1,
+            denoiser_layers: 1,
+            ..DiffLocConfig::small()
+        },
+        turn_rad: 0.5,
+        shift_m: 0.5,
+        run: RunConfig { batch: 24, learning_rate: 5e-3, ..run(&dir.path().join("diffloc"), steps) },
+    };
+    let (mut noise, mut found_m) = (Vec::new(), Vec::new());
+    let summary = train_diffloc(&config(200), &mut |report| match report {
+        DiffLocReport::Imaging(..) => {}
+        DiffLocReport::Stepped { noise_l1, accuracy, .. } => {
+            noise.push(*noise_l1);
+            found_m.push(accuracy.p50_m);
+        }
+        DiffLocReport::Validated(..) => {}
+    })
+    .unwrap();
+    assert_eq!(summary.sweeps, 48);
+    assert!(noise.last().unwrap() < &(0.7 * noise[0]), "{noise:?} {found_m:?} {:?}", summary.validation);
+    assert!(summary.validation.unwrap().p50_m < 30.0, "{:?}", summary.validation);
+
+    let mut localizer = load_competitor(&summary.trained.weights, Device::Cpu, PoseSolver::default()).unwrap();
+    let dataset = dataset::open(&scenes).unwrap();
+    let frame = dataset.scenarios[0].load(0, 3, &LoadOptions::default()).unwrap();
+    let first = localizer.localize(&frame.points).unwrap().estimate;
+    assert_eq!(localizer.localize(&frame.points).unwrap().estimate, first, "same sweep, same answer");
+    let nan = PointCloud { xyzi: vec![[f32::NAN; 4]; 5000] };
+    let none = PoseEstimate::NoPose { reason: NoPoseReason::TooFewPoints, inlier_count: 0 };
+    assert_eq!(localizer.localize(&nan).unwrap().estimate, none);
+
+    let mut resumed = config(203);
+    resumed.run.resume = true;
+    assert_eq!(train_diffloc(&resumed, &mut |_| ()).unwrap().trained.steps, 203);
 }
 
 #[test]

@@ -18,7 +18,7 @@ use crate::pgc::voxelise::SweepVoxels;
 use perception::weights::Weights;
 
 /// Confidence of a pose that is regressed directly: such a network predicts no error.
-const FULL_CONFIDENCE: f32 = 1.0;
+pub(super) const FULL_CONFIDENCE: f32 = 1.0;
 
 /// A network that was trained end to end on one scene, with the step from its output to a pose.
 ///
@@ -134,12 +134,12 @@ impl Localize for EndToEndLocalizer {
     }
 }
 
-fn no_pose(reason: NoPoseReason, times: LocalizerTimes) -> Localization {
+pub(super) fn no_pose(reason: NoPoseReason, times: LocalizerTimes) -> Localization {
     Localization::from_estimate(PoseEstimate::NoPose { reason, inlier_count: 0 }, times)
 }
 
 /// Position relative to the origin, cosine and sine of the heading; `None` if that is no pose.
-fn upright(answer: &[f32], origin_m: [f64; 3]) -> Option<Isometry3<f64>> {
+pub(super) fn upright(answer: &[f32], origin_m: [f64; 3]) -> Option<Isometry3<f64>> {
     let &[x, y, z, cosine, sine] = answer else { return None };
     let [x, y, z, cosine, sine] = [x, y, z, cosine, sine].map(f64::from);
     // Cosine and sine have length 1, unless the network gives no heading.

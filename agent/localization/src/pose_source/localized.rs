@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 
 use super::motion_gate::{MotionGate, MotionGateConfig};
 use super::{PoseInput, PoseSource};
-use crate::competitors::{EndToEndLocalizer, LightLoc};
+use crate::competitors::{LightLoc, load_competitor};
 use crate::pgc::pose_solver::PoseSolver;
 use crate::pgc::{Localize, Localizer, LocalizerError};
 
@@ -73,8 +73,8 @@ impl LocalizedPose {
     /// # Errors
     /// [`LocalizerError`] names the file and what is wrong with it.
     pub fn end_to_end(config: &EndToEndPoseConfig, inference: Inference) -> Result<Self, LocalizerError> {
-        let localizer = EndToEndLocalizer::load(&config.weights, inference.device)?;
-        Ok(Self::new(Box::new(localizer), config.motion_gate.clone()))
+        let localizer = load_competitor(&config.weights, inference.device, PoseSolver::default())?;
+        Ok(Self::new(localizer, config.motion_gate.clone()))
     }
 
     /// The same with another localizer.

@@ -12,7 +12,7 @@ use agent_offline::sweep_database::read_database;
 use anyhow::Context;
 use clap::ValueEnum;
 use dataset::{self, LeftOut};
-use localization::competitors::{EndToEndLocalizer, LightLoc, Retrieval};
+use localization::competitors::{LightLoc, Retrieval, load_competitor};
 use localization::pgc::confidence::{CONFIDENCE_KEY, Confidence, ConfidenceModel, FitReport, check_good_loss};
 use localization::pgc::pose_solver::{PoseSolver, Solver};
 use localization::pgc::wrong_place::wrong_place_hint;
@@ -52,7 +52,7 @@ pub(crate) struct Args {
         default_value = "deploy/weights/pgc-town1.safetensors"
     )]
     head: Vec<SceneHeadFile>,
-    /// Weights of a network that `agent train end-to-end` wrote, instead of encoder and head.
+    /// Weights of a competitor (`agent train end-to-end`, `diffloc`, `hypliloc`), instead of encoder and head.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["encoder", "head", "fit_confidence"])]
     end_to_end: Option<PathBuf>,
     /// Leave out what PGC adds to LightLoc: predicted error, refinement and confidence.
@@ -229,9 +229,7 @@ impl Args {
         };
         let plain = PoseSolver { solver: solver.clone(), ..PoseSolver::default() };
         if let Some(weights) = &self.end_to_end {
-            let mut localizer = EndToEndLocalizer::load(weights, inference.device).map_err(BadInput::of)?;
-            localizer.set_solver(plain);
-            return Ok(Box::new(localizer));
+            return load_competitor(weights, inference.device, plain).map_err(BadInput::of);
         }
         let load = if self.fit_confidence { Localizer::load_without_confidence } else { Localizer::load };
         let mut localizer = load(&self.encoder(head), head, inference).map_err(BadInput::of)?;

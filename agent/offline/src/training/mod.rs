@@ -2,10 +2,12 @@
 //! only a head on the frozen encoder's features.
 
 mod contrast;
+mod diffloc_training;
 mod encoder_training;
 mod end_to_end_training;
 mod error;
 mod feature_cache;
+mod hypliloc_training;
 mod kmeans;
 mod pairs;
 mod redundancy;
@@ -14,11 +16,13 @@ mod scene_validation;
 mod sweep_store;
 mod turned_sweep;
 
+pub use diffloc_training::{DiffLocAccuracy, DiffLocReport, DiffLocSummary, DiffLocTrainConfig, train_diffloc};
 pub use encoder_training::{EncoderAccuracy, EncoderReport, EncoderSummary, EncoderTrainConfig, train_encoder};
 pub use end_to_end_training::{EncoderStart, EndToEndReport, EndToEndTrainConfig, train_end_to_end};
 pub use error::LocalizerTrainError;
 pub(crate) use feature_cache::FeatureCache;
 pub use feature_cache::SweepAugmentation;
+pub use hypliloc_training::{HypLiLocReport, HypLiLocTrainConfig, train_hypliloc};
 pub(crate) use kmeans::kmeans;
 pub use pairs::Pair;
 pub(crate) use redundancy::Redundancy;

@@ -192,14 +192,26 @@ impl SweepList {
     /// is counted.
     pub(crate) fn read(&self, index: usize, range_m: f64) -> Option<StoredSweep> {
         let Place { world, drive, .. } = self.places[index];
-        let (mut frame, ..) = self.frame(index)?;
+        let (mut frame, pose) = self.posed_frame(index)?;
+        let range = range_m as f32;
+        frame.points.xyzi.retain(|[x, y, z, _]| x * x + y * y <= range * range && z.is_finite());
+        Some(StoredSweep::new(world, drive, pose, &frame.points.xyzi))
+    }
+
+    /// Reads the whole frame of a sweep with the pose of its sensor; `None` if that is unknown or the frame cannot be
+    /// read, which is counted.
+    pub(crate) fn posed_frame(&self, index: usize) -> Option<(Frame, Isometry3<f64>)> {
+        let (frame, ..) = self.frame(index)?;
         let Some(pose) = frame.world_from_lidar else {
             self.without_pose.lock().unwrap_or_else(PoisonError::into_inner).insert(index);
             return None;
         };
-        let range = range_m as f32;
-        frame.points.xyzi.retain(|[x, y, z, _]| x * x + y * y <= range * range && z.is_finite());
-        Some(StoredSweep::new(world, drive, pose.isometry(), &frame.points.xyzi))
+        Some((frame, pose.isometry()))
+    }
+
+    /// Drive of a sweep.
+    pub(crate) fn drive(&self, index: usize) -> Option<usize> {
+        Some(self.places.get(index)?.drive)
     }
 }
 

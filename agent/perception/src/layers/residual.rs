@@ -9,7 +9,7 @@ const NORM: (f64, f64) = (1e-5, 0.1);
 
 /// Two 3x3 convolutions with a skip connection, strided and projected if its shape has to change.
 #[derive(Debug)]
-pub(crate) struct ResidualBlock {
+pub struct ResidualBlock {
     first: ConvLayer,
     second: ConvLayer,
     shortcut: Option<ConvLayer>,
@@ -19,7 +19,7 @@ impl ResidualBlock {
     /// Chain of `blocks`, the first with `stride`; parameters `<position>.{conv1,bn1,conv2,bn2}.*` and
     /// `0.downsample.{0,1}.*` under `path`.
     #[must_use]
-    pub(crate) fn chain(path: &nn::Path<'_>, [input, filters]: [i64; 2], blocks: usize, stride: i64) -> Vec<Self> {
+    pub fn chain(path: &nn::Path<'_>, [input, filters]: [i64; 2], blocks: usize, stride: i64) -> Vec<Self> {
         (0..blocks)
             .map(|position| match position {
                 0 => Self::new(&(path / position), [input, filters], stride),
@@ -42,7 +42,8 @@ impl ResidualBlock {
     }
 
     /// `[N, C_in, H, W]` to `[N, C, H', W']`.
-    pub(crate) fn forward(&self, x: &Tensor, train: bool) -> Tensor {
+    #[must_use]
+    pub fn forward(&self, x: &Tensor, train: bool) -> Tensor {
         let beside = match &self.shortcut {
             Some(shortcut) => shortcut.forward(x, train),
             None => x.shallow_clone(),

@@ -16,7 +16,7 @@ use support::cli::BadInput;
 #[derive(Debug, clap::Args)]
 pub(crate) struct Arguments {
     /// Datasets, splits or scenarios; the first vehicle of each scenario is the ego.
-    #[arg(long, required = true, num_args = 1.., value_name = "DIR")]
+    #[arg(long = "dataset", required = true, num_args = 1.., value_name = "DIR")]
     data: Vec<PathBuf>,
     /// Number that stored intensities are divided by [default: auto; see `sim-replay inspect --help`].
     #[arg(long, value_name = "auto|1|255|NUMBER", default_value_t, hide_default_value = true)]

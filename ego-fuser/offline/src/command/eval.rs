@@ -30,7 +30,7 @@ struct Data {
 #[derive(Debug, clap::Args)]
 pub(crate) struct Arguments {
     /// Datasets, splits or scenarios.
-    #[arg(long, required = true, num_args = 1.., value_name = "DIR")]
+    #[arg(long = "dataset", required = true, num_args = 1.., value_name = "DIR")]
     data: Vec<PathBuf>,
     /// Number that stored intensities are divided by [default: auto; see `sim-replay inspect --help`].
     #[arg(long, value_name = "auto|1|255|NUMBER", default_value_t, hide_default_value = true)]
@@ -42,7 +42,7 @@ pub(crate) struct Arguments {
     #[arg(long, value_enum, default_value_t)]
     precision: InferencePrecision,
     /// Methods, one after another; none named: that of the weights.
-    #[arg(long, num_args = 1..)]
+    #[arg(long, value_name = "NAME", num_args = 1.., value_delimiter = ',')]
     method: Vec<Method>,
     /// Largest number of frames of every scenario.
     #[arg(long)]

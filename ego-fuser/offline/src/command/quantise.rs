@@ -20,7 +20,7 @@ pub(crate) struct Arguments {
     #[arg(required = true, value_name = "FILE")]
     weights: Vec<PathBuf>,
     /// Datasets, splits or scenarios; the first vehicle of each scenario is the ego.
-    #[arg(long, required = true, num_args = 1.., value_name = "DIR")]
+    #[arg(long = "dataset", required = true, num_args = 1.., value_name = "DIR")]
     data: Vec<PathBuf>,
     /// Number that stored intensities are divided by [default: auto; see `sim-replay inspect --help`].
     #[arg(long, value_name = "auto|1|255|NUMBER", default_value_t, hide_default_value = true)]
@@ -36,7 +36,7 @@ impl Arguments {
         tch::set_num_threads(1);
         let scenarios = scenarios(&self.data, self.intensity_scale)?;
         if scenarios.iter().all(|scenario| scenario.ticks.is_empty()) || self.frames == 0 {
-            return Err(BadInput::new("--data and --frames: no frame to search scales on").into());
+            return Err(BadInput::new("--dataset and --frames: no frame to search scales on").into());
         }
         let mut left_out = LeftOut::default();
         for path in &self.weights {

@@ -27,7 +27,7 @@ use support::cli::BadInput;
 #[derive(Debug, clap::Args)]
 pub(crate) struct Arguments {
     /// Datasets, splits or scenarios to learn from.
-    #[arg(long, required = true, num_args = 1.., value_name = "DIR")]
+    #[arg(long = "dataset", required = true, num_args = 1.., value_name = "DIR")]
     data: Vec<PathBuf>,
     /// Datasets to measure AP on; none: no validation.
     #[arg(long, num_args = 1.., value_name = "DIR")]

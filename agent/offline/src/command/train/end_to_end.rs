@@ -15,7 +15,7 @@ pub(crate) struct Args {
     /// Folders of sweeps, all of the same scene.
     #[arg(long, required = true, num_args = 1.., value_name = "DIR")]
     scenes: Vec<PathBuf>,
-    /// Target of the regression: sgloc regresses coordinates of cells, pose stands for HypLiLoc and DiffLoc.
+    /// Target of the regression: coordinates of cells after SGLoc, or the pose itself from pooled features.
     #[arg(long, value_enum)]
     regresses: Regresses,
     /// Name of the scene, for messages and the model card.

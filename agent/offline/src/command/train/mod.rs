@@ -1,7 +1,9 @@
 //! `agent train`: the two stages of a localizer.
 
+mod diffloc;
 mod encoder;
 mod end_to_end;
+mod hypliloc;
 pub(super) mod options;
 mod scene;
 
@@ -21,6 +23,10 @@ enum Stage {
     Encoder(encoder::Args),
     Scene(scene::Args),
     EndToEnd(end_to_end::Args),
+    #[command(name = "diffloc")]
+    DiffLoc(diffloc::Args),
+    #[command(name = "hypliloc")]
+    HypLiLoc(hypliloc::Args),
 }
 
 /// Runs the chosen stage.
@@ -30,5 +36,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         Stage::Encoder(args) => encoder::run(args),
         Stage::Scene(args) => scene::run(args),
         Stage::EndToEnd(args) => end_to_end::run(args),
+        Stage::DiffLoc(args) => diffloc::run(args),
+        Stage::HypLiLoc(args) => hypliloc::run(args),
     }
 }

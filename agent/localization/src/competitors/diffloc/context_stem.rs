@@ -1,0 +1,109 @@
+//! Stem: residual context blocks at the resolution of the range image, then one token per patch.
+
+use perception::layers::convolution::Norm;
+use tch::nn::{self, Init};
+use tch::{Device, Kind, TchError, Tensor};
+
+use super::config::DiffLocConfig;
+use super::range_image::CHANNELS;
+use crate::pgc::dense::Dense;
+
+/// Epsilon and momentum of the batch norms.
+const NORM: (f64, f64) = (1e-5, 0.1);
+
+/// A convolution that keeps the size, with a leaky rectifier.
+#[derive(Debug)]
+struct Convolution {
+    weight: Tensor,
+    bias: Tensor,
+    padding: i64,
+    dilation: i64,
+}
+
+impl Convolution {
+    fn new(path: &nn::Path<'_>, [inputs, outputs]: [i64; 2], kernel: i64, dilation: i64) -> Self {
+        Self {
+            weight: path.var("weight", &[outputs, inputs, kernel, kernel], nn::init::DEFAULT_KAIMING_UNIFORM),
+            bias: path.var("bias", &[outputs], Init::Const(0.0)),
+            padding: dilation * (kernel / 2),
+            dilation,
+        }
+    }
+
+    fn forward(&self, x: &Tensor) -> Result<Tensor, TchError> {
+        let (weight, bias) = (self.weight.f_to_kind(x.kind())?, self.bias.f_to_kind(x.kind())?);
+        let [padding, dilation] = [self.padding, self.dilation];
+        x.f_conv2d(&weight, Some(bias), [1, 1], [padding, padding], [dilation, dilation], 1)?.f_leaky_relu()
+    }
+}
+
+/// Context block: a 1 x 1 convolution, and two wider ones, the second dilated, beside it.
+#[derive(Debug)]
+struct ContextBlock {
+    shortcut: Convolution,
+    near: (Convolution, Norm),
+    far: (Convolution, Norm),
+}
+
+impl ContextBlock {
+    fn new(path: &nn::Path<'_>, inputs: i64, outputs: i64) -> Self {
+        let (eps, momentum) = NORM;
+        let normed = |name: &str, dilation| {
+            let below = path / name;
+            let norm = Norm::with_eps(&(&below / "norm"), outputs, eps, momentum);
+            (Convolution::new(&below, [outputs, outputs], 3, dilation), norm)
+        };
+        Self {
+            shortcut: Convolution::new(&(path / "shortcut"), [inputs, outputs], 1, 1),
+            near: normed("near", 1),
+            far: normed("far", 2),
+        }
+    }
+
+    fn forward(&self, x: &Tensor, train: bool) -> Result<Tensor, TchError> {
+        let shortcut = self.shortcut.forward(x)?;
+        let near = self.near.1.forward(&self.near.0.forward(&shortcut)?, train);
+        let far = self.far.1.forward(&self.far.0.forward(&near)?, train);
+        shortcut.f_add(&far)
+    }
+}
+
+/// From range images to tokens.
+#[derive(Debug)]
+pub(super) struct ContextStem {
+    blocks: Vec<ContextBlock>,
+    patch: [i64; 2],
+    project: Dense,
+}
+
+impl ContextStem {
+    /// Builds the layers below `path`.
+    pub(super) fn new(path: &nn::Path<'_>, config: &DiffLocConfig) -> Self {
+        let [first, last] = config.stem;
+        let widths = [CHANNELS as i64, first, first, first, last];
+        let block = |number: usize| ContextBlock::new(&(path / number), widths[number], widths[number + 1]);
+        Self {
+            blocks: (0..4).map(block).collect(),
+            patch: config.patch,
+            project: Dense::new(&(path / "project"), last, config.width, 0.7),
+        }
+    }
+
+    /// `[B, CHANNELS, rows, columns]` to tokens `[B, T, width]`, row by row.
+    pub(super) fn forward(&self, images: &Tensor, train: bool) -> Result<Tensor, TchError> {
+        let mut x = channels_last(images)?;
+        for block in &self.blocks {
+            x = block.forward(&x, train)?;
+        }
+        let pooled = x.f_avg_pool2d(self.patch, self.patch, [0, 0], false, true, None)?;
+        super::transformer::dense(&self.project, &pooled.f_flatten(2, 3)?.f_transpose(1, 2)?)
+    }
+}
+
+/// Channels next to each other in memory on a GPU, where convolutions in half precision are faster so.
+fn channels_last(x: &Tensor) -> Result<Tensor, TchError> {
+    match (x.device(), x.kind()) {
+        (Device::Cpu, _) | (_, Kind::Float) => Ok(x.shallow_clone()),
+        _ => x.f_permute([0, 2, 3, 1])?.f_contiguous()?.f_permute([0, 3, 1, 2]),
+    }
+}

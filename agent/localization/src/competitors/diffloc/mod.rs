@@ -1,0 +1,28 @@
+//! DiffLoc (Li et al. 2024), small: pose regression of a sweep by denoising diffusion, on features of its range image.
+//!
+//! A range image ([`RangeImageConfig`]) becomes tokens, a transformer describes them, and a mask weighs the tokens of
+//! static objects twice ([`SweepEncoder`]). The denoiser ([`PoseDenoiser`]) predicts the noise in the poses of up to
+//! three sweeps from their features, and a pose is found from noise in ten steps ([`NoiseSchedule::denoise`]).
+//!
+//! Departures from the paper: a transformer of six layers of 192 channels with random weights at the start, where the
+//! paper has a foundation model of 21 million parameters; a denoiser of three layers; cosine and sine of the heading in
+//! place of a quaternion's logarithm, since training turns sweeps all the way round and vehicles stand upright.
+
+mod config;
+mod context_stem;
+mod denoiser;
+mod layer_norm;
+mod localizer;
+mod network;
+mod noise_schedule;
+mod range_image;
+mod sweep_encoder;
+mod transformer;
+
+pub use config::DiffLocConfig;
+pub use denoiser::{PoseDenoiser, Windows};
+pub use localizer::DiffLocLocalizer;
+pub use network::DiffLoc;
+pub use noise_schedule::NoiseSchedule;
+pub use range_image::{CHANNELS, RangeImageConfig, UNITS};
+pub use sweep_encoder::{EncodedSweeps, SweepEncoder};

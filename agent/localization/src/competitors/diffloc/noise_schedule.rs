@@ -1,0 +1,126 @@
+//! Noise schedule: how much of a pose remains at each step of the diffusion, and the way back (DDIM, Song et al. 2021).
+
+use tch::{Device, TchError, Tensor};
+
+/// Steps of the diffusion.
+const STEPS: usize = 100;
+/// Variance that the first and the last step add; it grows linearly between them.
+const BETAS: [f64; 2] = [1e-4, 0.1];
+/// Largest magnitude of a predicted pose, in deviations of the training poses.
+const LIMIT: f64 = 4.0;
+
+/// Shares of signal and noise at each step.
+#[derive(Debug)]
+pub struct NoiseSchedule {
+    /// Product of `1 - beta` up to each step.
+    kept: Vec<f64>,
+    /// `[STEPS]`: factors of the pose and of the noise.
+    factors: [Tensor; 2],
+}
+
+impl NoiseSchedule {
+    /// The schedule, with its tables on a device.
+    ///
+    /// # Errors
+    /// Those of the tensor library.
+    pub fn new(device: Device) -> Result<Self, TchError> {
+        let beta = |step: usize| BETAS[0] + (BETAS[1] - BETAS[0]) * step as f64 / (STEPS - 1) as f64;
+        let kept: Vec<f64> = (0..STEPS)
+            .scan(1.0, |product, step| {
+                *product *= 1.0 - beta(step);
+                Some(*product)
+            })
+            .collect();
+        let table = |factor: fn(f64) -> f64| {
+            let values: Vec<f32> = kept.iter().map(|&kept| factor(kept) as f32).collect();
+            Tensor::f_from_slice(&values)?.f_to_device(device)
+        };
+        let factors = [table(f64::sqrt)?, table(|kept| (1.0 - kept).sqrt())?];
+        Ok(Self { kept, factors })
+    }
+
+    /// Number of steps.
+    #[must_use]
+    pub fn steps(&self) -> i64 {
+        self.kept.len() as i64
+    }
+
+    /// Poses `[W, F, D]` with `noise` of the same shape, at steps `[W]`.
+    ///
+    /// # Errors
+    /// Those of the tensor library.
+    pub fn add_noise(&self, poses: &Tensor, noise: &Tensor, steps: &Tensor) -> Result<Tensor, TchError> {
+        let factor = |table: &Tensor| table.f_index_select(0, steps)?.f_view([-1, 1, 1]);
+        let [signal, deviation] = &self.factors;
+        poses.f_mul(&factor(signal)?)?.f_add(&noise.f_mul(&factor(deviation)?)?)
+    }
+
+    /// Finds poses from noise in `count` steps without randomness; `predict` tells the noise in poses at a step.
+    ///
+    /// # Errors
+    /// Those of the tensor library and of `predict`.
+    pub fn denoise(
+        &self,
+        noise: &Tensor,
+        count: usize,
+        mut predict: impl FnMut(&Tensor, i64) -> Result<Tensor, TchError>,
+    ) -> Result<Tensor, TchError> {
+        let last = (self.kept.len() - 1) as f64;
+        let mut steps: Vec<usize> = (0..count.max(1))
+            .map(|number| (last * (1.0 - number as f64 / (count.max(2) - 1) as f64)).round() as usize)
+            .collect();
+        steps.dedup();
+        let mut noisy = noise.shallow_clone();
+        let mut poses = noise.shallow_clone();
+        for (place, &step) in steps.iter().enumerate() {
+            let kept = self.kept[step];
+            let predicted = predict(&noisy, step as i64)?;
+            poses = noisy.f_sub(&(predicted * (1.0 - kept).sqrt()))?.f_div_scalar(kept.sqrt())?;
+            poses = poses.f_clamp(-LIMIT, LIMIT)?;
+            if let Some(&next) = steps.get(place + 1) {
+                // The noise that leads from these poses to where they came from.
+                let noise = noisy.f_sub(&(&poses * kept.sqrt()))? / (1.0 - kept).sqrt();
+                noisy = &poses * self.kept[next].sqrt() + noise * (1.0 - self.kept[next]).sqrt();
+            }
+        }
+        Ok(poses)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_perfect_denoiser_finds_the_pose_from_any_noise() {
+        tch::set_num_threads(1);
+        tch::manual_seed(1);
+        let schedule = NoiseSchedule::new(Device::Cpu).unwrap();
+        let truth = Tensor::from_slice(&[0.5f32, -1.5, 0.1, 0.6, -0.8]).view([1, 1, 5]);
+        let start = Tensor::randn([1, 1, 5], (Kind::Float, Device::Cpu));
+        let perfect = |noisy: &Tensor, step: i64| {
+            let kept = schedule.kept[step as usize];
+            Ok((noisy - &truth * kept.sqrt()) / (1.0 - kept).sqrt())
+        };
+        let mut calls = 0;
+        let found = schedule
+            .denoise(&start, 10, |noisy, step| {
+                calls += 1;
+                perfect(noisy, step)
+            })
+            .unwrap();
+        assert_eq!(calls, 10);
+        assert!((found - &truth).abs().max().double_value(&[]) < 1e-4);
+    }
+
+    #[test]
+    fn little_noise_is_added_at_the_first_step_and_little_pose_remains_at_the_last() {
+        let schedule = NoiseSchedule::new(Device::Cpu).unwrap();
+        let poses = Tensor::ones([2, 3, 5], (Kind::Float, Device::Cpu));
+        let noise = -&poses;
+        let noisy = schedule.add_noise(&poses, &noise, &Tensor::from_slice(&[0_i64, schedule.steps() - 1])).unwrap();
+        let value = |window| noisy.double_value(&[window, 2, 4]);
+        assert!((value(0) - (0.9999_f64.sqrt() - 0.01)).abs() < 1e-6);
+        assert!(value(1) < -0.9, "{}", value(1));
+    }
+}

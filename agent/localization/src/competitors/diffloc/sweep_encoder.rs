@@ -1,0 +1,69 @@
+//! Encoder of sweeps: range images to one feature each, with a mask of static objects.
+
+use tch::nn::{self, Init};
+use tch::{Kind, TchError, Tensor};
+
+use super::config::DiffLocConfig;
+use super::context_stem::ContextStem;
+use super::layer_norm::LayerNorm;
+use super::transformer::{TransformerLayer, dense};
+use crate::pgc::dense::Dense;
+
+/// Channels of the perceptrons, relative to those of a token.
+const EXPANSION: i64 = 4;
+
+/// Stem, transformer and static-object-aware pooling.
+#[derive(Debug)]
+pub struct SweepEncoder {
+    stem: ContextStem,
+    places: Tensor,
+    layers: Vec<TransformerLayer>,
+    norm: LayerNorm,
+    mask: Dense,
+}
+
+/// Encoded range images.
+#[derive(Debug)]
+pub struct EncodedSweeps {
+    /// `[B, width]`, single precision.
+    pub features: Tensor,
+    /// `[B, T]`: logit that a token shows static objects, single precision.
+    pub static_logits: Tensor,
+}
+
+impl SweepEncoder {
+    /// Builds the layers below `path`.
+    #[must_use]
+    pub fn new(path: &nn::Path<'_>, config: &DiffLocConfig) -> Self {
+        let DiffLocConfig { width, heads, layers, drop_path, .. } = *config;
+        let layer = |number: usize| {
+            let drop = drop_path * number as f64 / (layers.max(2) - 1) as f64;
+            TransformerLayer::new(&(path / "layers" / number), width, heads, EXPANSION, drop)
+        };
+        Self {
+            stem: ContextStem::new(&(path / "stem"), config),
+            places: path.var("places", &[config.tokens(), width], Init::Randn { mean: 0.0, stdev: 0.02 }),
+            layers: (0..layers).map(layer).collect(),
+            norm: LayerNorm::new(&(path / "norm"), width),
+            mask: Dense::new(&(path / "mask"), width, 1, 0.1),
+        }
+    }
+
+    /// Encodes `[B, CHANNELS, rows, columns]`; products are computed in the precision of the images.
+    ///
+    /// # Errors
+    /// Those of the tensor library.
+    pub fn forward(&self, images: &Tensor, train: bool) -> Result<EncodedSweeps, TchError> {
+        let mut x = self.stem.forward(images, train)?.f_add(&self.places.f_to_kind(images.kind())?)?;
+        for layer in &self.layers {
+            x = layer.forward(&x, None, train)?;
+        }
+        let x = self.norm.forward(&x)?.f_to_kind(Kind::Float)?;
+        let logits = dense(&self.mask, &x)?;
+        let weighted = x.f_add(&x.f_mul(&logits.f_sigmoid()?)?)?;
+        Ok(EncodedSweeps {
+            features: weighted.f_mean_dim(1_i64, false, Kind::Float)?,
+            static_logits: logits.f_squeeze_dim(2)?,
+        })
+    }
+}

@@ -1,0 +1,89 @@
+//! Transformer layer: self-attention and a perceptron, each behind a normalisation and beside a shortcut.
+
+use tch::nn;
+use tch::{Kind, TchError, Tensor};
+
+use super::layer_norm::LayerNorm;
+use crate::pgc::dense::Dense;
+
+/// Gain of layers at whose end no rectifier follows, relative to He's.
+const LINEAR_GAIN: f64 = 0.7;
+/// Gain of the last layer of each branch: the layer is near the identity at the start.
+const BRANCH_GAIN: f64 = 0.2;
+
+/// One layer of `width` channels.
+#[derive(Debug)]
+pub(super) struct TransformerLayer {
+    before_attention: LayerNorm,
+    qkv: Dense,
+    outward: Dense,
+    before_perceptron: LayerNorm,
+    up: Dense,
+    down: Dense,
+    heads: i64,
+    drop_path: f64,
+}
+
+impl TransformerLayer {
+    /// Layer with a perceptron of `expansion * width` channels; `drop_path` is the share of samples without each branch
+    /// in training.
+    pub(super) fn new(path: &nn::Path<'_>, width: i64, heads: i64, expansion: i64, drop_path: f64) -> Self {
+        let hidden = expansion * width;
+        Self {
+            before_attention: LayerNorm::new(&(path / "norm1"), width),
+            qkv: Dense::new(&(path / "qkv"), width, 3 * width, LINEAR_GAIN),
+            outward: Dense::new(&(path / "outward"), width, width, BRANCH_GAIN),
+            before_perceptron: LayerNorm::new(&(path / "norm2"), width),
+            up: Dense::new(&(path / "up"), width, hidden, LINEAR_GAIN),
+            down: Dense::new(&(path / "down"), hidden, width, BRANCH_GAIN),
+            heads,
+            drop_path,
+        }
+    }
+
+    /// `[B, T, width]` to the same; `mask` is added to the logits of the attention,
+    /// `[B or 1, 1, T, T]`; products are in the precision of `x`, which has to be single with a mask.
+    pub(super) fn forward(&self, x: &Tensor, mask: Option<&Tensor>, train: bool) -> Result<Tensor, TchError> {
+        let attended = self.attend(&self.before_attention.forward(x)?, mask)?;
+        let x = x.f_add(&self.keep_some(attended, train)?)?;
+        let hidden = dense(&self.up, &self.before_perceptron.forward(&x)?)?.f_gelu("none")?;
+        let answer = dense(&self.down, &hidden)?;
+        x.f_add(&self.keep_some(answer, train)?)
+    }
+
+    fn attend(&self, x: &Tensor, mask: Option<&Tensor>) -> Result<Tensor, TchError> {
+        let (batch, tokens, width) = x.size3()?;
+        let parts = dense(&self.qkv, x)?.f_view([batch, tokens, 3, self.heads, width / self.heads])?;
+        let parts = parts.f_permute([2, 0, 3, 1, 4])?;
+        let [query, key, value] = [parts.f_select(0, 0)?, parts.f_select(0, 1)?, parts.f_select(0, 2)?];
+        let found = match mask {
+            None => {
+                let none = None::<Tensor>;
+                Tensor::f_scaled_dot_product_attention(&query, &key, &value, none, 0.0, false, None, false)?
+            }
+            Some(mask) => {
+                let scale = 1.0 / ((width / self.heads) as f64).sqrt();
+                let logits = query.f_matmul(&key.f_transpose(2, 3)?)?.f_mul_scalar(scale)?.f_add(mask)?;
+                logits.f_softmax(3, Kind::Float)?.f_matmul(&value)?
+            }
+        };
+        dense(&self.outward, &found.f_transpose(1, 2)?.f_reshape([batch, tokens, width])?)
+    }
+
+    /// Stochastic depth: zeroes the branch of some samples and scales the others.
+    fn keep_some(&self, branch: Tensor, train: bool) -> Result<Tensor, TchError> {
+        if !train || self.drop_path <= 0.0 {
+            return Ok(branch);
+        }
+        let keep = 1.0 - self.drop_path;
+        let drawn = Tensor::f_rand([branch.size()[0], 1, 1], (Kind::Float, branch.device()))?;
+        let kept = drawn.f_lt(keep)?.f_to_kind(branch.kind())?.f_div_scalar(keep)?;
+        branch.f_mul(&kept)
+    }
+}
+
+/// A dense layer on the last dimension of `[B, T, inputs]`.
+pub(super) fn dense(layer: &Dense, x: &Tensor) -> Result<Tensor, TchError> {
+    let (batch, tokens, inputs) = x.size3()?;
+    layer.forward(&x.f_reshape([batch * tokens, inputs])?)?.f_view([batch, tokens, -1])
+}

@@ -1,0 +1,49 @@
+//! Fusion of the tokens of both branches in Euclidean and hyperbolic space.
+
+use tch::nn::{self, Init};
+use tch::{Kind, TchError, Tensor};
+
+use super::graph_attention::{GraphAttention, Space};
+use super::network::WIDTH;
+
+/// Graph attention in both spaces, summed with learnt weights.
+#[derive(Debug)]
+pub(super) struct Fusion {
+    euclidean: GraphAttention,
+    poincare: GraphAttention,
+    weights: Tensor,
+}
+
+impl Fusion {
+    /// Builds the layers below `path`.
+    pub(super) fn new(path: &nn::Path<'_>) -> Self {
+        Self {
+            euclidean: GraphAttention::with_metric(&(path / "euclidean"), WIDTH, Space::Euclidean),
+            poincare: GraphAttention::with_metric(&(path / "poincare"), WIDTH, Space::Poincare),
+            weights: path.var("weights", &[2], Init::Const(1.0)),
+        }
+    }
+
+    /// `[S, P + I + 2, WIDTH]` of tokens `[S, P, WIDTH]` of points and `[S, I, WIDTH]` of the image: in this order, then
+    /// one pooled token of each.
+    ///
+    /// # Errors
+    /// Those of the tensor library.
+    pub(super) fn forward(&self, points: &Tensor, image: &Tensor) -> Result<Tensor, TchError> {
+        let pooled = |tokens: &Tensor| tokens.f_mean_dim(1_i64, true, Kind::Float);
+        let tokens = [points.shallow_clone(), image.shallow_clone(), pooled(points)?, pooled(image)?];
+        let tokens = Tensor::f_cat(&tokens, 1)?;
+        let weight = |number| self.weights.f_select(0, number);
+        let euclidean = self.euclidean.forward(&tokens)?.f_mul(&weight(0)?)?;
+        euclidean.f_add(&self.poincare.forward(&tokens)?.f_mul(&weight(1)?)?)
+    }
+}
+
+/// Tokens of length 1.
+///
+/// # Errors
+/// Those of the tensor library.
+pub(super) fn normalise(tokens: &Tensor) -> Result<Tensor, TchError> {
+    let squares = tokens.f_square()?.f_sum_dim_intlist(-1_i64, true, Kind::Float)?;
+    tokens.f_div(&squares.f_add_scalar(1e-12)?.f_sqrt()?)
+}

@@ -1,0 +1,76 @@
+//! Graph attention between all tokens of a sweep, in Euclidean space or in Poincare balls.
+
+use tch::nn::{self, Init};
+use tch::{TchError, Tensor, no_grad};
+
+use super::dense_norm::{TokenNorm, of_tokens};
+use super::poincare::{expmap0, logmap0};
+use crate::pgc::dense::Dense;
+
+/// Heads of the attention.
+const HEADS: i64 = 8;
+
+/// Space in which tokens are compared and averaged.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Space {
+    /// Vectors.
+    Euclidean,
+    /// Points of one ball for each head.
+    Poincare,
+}
+
+/// One layer: linear map, attention, layer norm, ReLU.
+#[derive(Debug)]
+pub(super) struct GraphAttention {
+    dense: Dense,
+    metric: Option<Tensor>,
+    norm: TokenNorm,
+    space: Space,
+}
+
+impl GraphAttention {
+    /// Attention by the scalar product, between points.
+    pub(super) fn plain(path: &nn::Path<'_>, channels: i64) -> Self {
+        Self::new(path, channels, None, Space::Euclidean)
+    }
+
+    /// Attention by a learnt metric, which all heads share; it begins as the identity.
+    pub(super) fn with_metric(path: &nn::Path<'_>, channels: i64, space: Space) -> Self {
+        let edge = channels / HEADS;
+        let mut metric = path.var("metric", &[edge, edge], Init::Const(0.0));
+        no_grad(|| metric.copy_(&Tensor::eye(edge, (metric.kind(), metric.device()))));
+        Self::new(path, channels, Some(metric), space)
+    }
+
+    fn new(path: &nn::Path<'_>, channels: i64, metric: Option<Tensor>, space: Space) -> Self {
+        let (dense, norm) = (Dense::new(path, channels, channels, 1.0), TokenNorm::new(&(path / "norm"), channels));
+        Self { dense, metric, norm, space }
+    }
+
+    /// `[S, T, C]` in single precision.
+    ///
+    /// Weighted means of points of a ball lie in it, since it is convex.
+    ///
+    /// # Errors
+    /// Those of the tensor library.
+    pub(super) fn forward(&self, tokens: &Tensor) -> Result<Tensor, TchError> {
+        let (sweeps, count, channels) = tokens.size3()?;
+        let values =
+            of_tokens(&self.dense, tokens)?.f_view([sweeps, count, HEADS, channels / HEADS])?.f_transpose(1, 2)?;
+        let values = match self.space {
+            Space::Euclidean => values,
+            Space::Poincare => expmap0(&values)?,
+        };
+        let query = match &self.metric {
+            Some(metric) => values.f_matmul(metric)?,
+            None => values.shallow_clone(),
+        };
+        let mask = None::<Tensor>;
+        let mean = Tensor::f_scaled_dot_product_attention(&query, &values, &values, mask, 0.0, false, 1.0, false)?;
+        let mean = match self.space {
+            Space::Euclidean => mean,
+            Space::Poincare => logmap0(&mean)?,
+        };
+        self.norm.forward(&mean.f_transpose(1, 2)?.f_reshape([sweeps, count, channels])?)
+    }
+}

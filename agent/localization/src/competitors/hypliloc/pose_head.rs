@@ -1,0 +1,46 @@
+//! Head of a branch: position and heading from the mean of its tokens.
+
+use tch::nn;
+use tch::{Kind, TchError, Tensor};
+
+use super::network::WIDTH;
+use crate::pgc::dense::Dense;
+
+/// Poses as the network states them.
+#[derive(Debug)]
+pub struct NormalisedPoses {
+    /// `[S, 3]` relative to the mean, in standard deviations of the training positions.
+    pub position: Tensor,
+    /// `[S, 2]` cosine and sine of the heading, of any length.
+    pub heading: Tensor,
+}
+
+/// Layers from the mean token to a pose.
+#[derive(Debug)]
+pub(super) struct PoseHead {
+    position: [Dense; 3],
+    heading: [Dense; 3],
+}
+
+impl PoseHead {
+    /// Builds the layers below `path`.
+    pub(super) fn new(path: &nn::Path<'_>) -> Self {
+        let chain = |name: &str, outputs| {
+            let layer = |number: usize, from, to, gain| Dense::new(&(path / name / number), from, to, gain);
+            [layer(0, WIDTH, 128, 1.0), layer(1, 128, 64, 1.0), layer(2, 64, outputs, 0.1)]
+        };
+        Self { position: chain("position", 3), heading: chain("heading", 2) }
+    }
+
+    /// Poses from the mean of tokens `[S, T, WIDTH]`.
+    ///
+    /// # Errors
+    /// Those of the tensor library.
+    pub(super) fn forward(&self, tokens: &Tensor) -> Result<NormalisedPoses, TchError> {
+        let mean = tokens.f_mean_dim(1_i64, false, Kind::Float)?;
+        let through = |[first, second, third]: &[Dense; 3]| {
+            third.forward(&second.forward(&first.forward(&mean)?.f_relu()?)?.f_relu()?)
+        };
+        Ok(NormalisedPoses { position: through(&self.position)?, heading: through(&self.heading)? })
+    }
+}

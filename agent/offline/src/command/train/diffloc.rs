@@ -1,0 +1,108 @@
+//! `agent train diffloc`: arguments, progress and model card.
+
+use std::path::PathBuf;
+
+use agent_offline::training::{DiffLocAccuracy, DiffLocReport, DiffLocTrainConfig, train_diffloc};
+use localization::competitors::diffloc::DiffLocConfig;
+use perception::train::{AdamWConfig, ModelCard, RunConfig, TrainingBar, TrainingOptions};
+
+use super::options::{bad, check_folders, print_left_out, run_config};
+
+/// Decoupled weight decay: sweeps are few beside the parameters.
+const WEIGHT_DECAY: f64 = 0.05;
+/// Largest norm of a gradient.
+const MAX_GRADIENT_NORM: f64 = 1.0;
+
+/// Train DiffLoc, a competitor of the localizer, on one scene; writes checkpoint, curve.csv, weights.safetensors and
+/// model-card.md.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// Folders of sweeps, all of the same scene.
+    #[arg(long, required = true, num_args = 1.., value_name = "DIR")]
+    scenes: Vec<PathBuf>,
+    /// Folders of sweeps of the same scene that are localized every 1000 steps.
+    #[arg(long, num_args = 1.., value_name = "DIR")]
+    validation: Vec<PathBuf>,
+    /// Name of the scene, for messages and the model card.
+    #[arg(long, default_value = "scene")]
+    scene_name: String,
+    /// Sweeps per step, in windows of three.
+    #[arg(long, default_value_t = 192)]
+    batch: usize,
+    /// Highest learning rate.
+    #[arg(long, default_value_t = 1e-3)]
+    lr: f64,
+    /// Largest random turn of the sensor to either side, degrees.
+    #[arg(long, value_name = "DEGREES", default_value_t = 180.0)]
+    turn: f64,
+    /// Largest random shift of the sensor along each horizontal axis, metres.
+    #[arg(long, value_name = "METRES", default_value_t = 1.0)]
+    shift: f64,
+    #[command(flatten)]
+    options: TrainingOptions,
+}
+
+pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
+    let config = args.config()?;
+    let bar = TrainingBar::of(config.run.length);
+    let summary = train_diffloc(&config, &mut |report| show(&bar, report))?;
+    bar.finish();
+    print_left_out(&bar, &summary.trained.data);
+    let title = format!("DiffLoc of {}", config.network.scene_name);
+    let mut card = ModelCard::new(
+        &title,
+        "Pose regression by denoising diffusion, trained from random weights on the sweeps of one scene.",
+    );
+    card.trained(&config.run, &summary.trained, &format!("{} sweeps", summary.sweeps), "sweeps");
+    card.row("augmentation", format_args!("turns up to {} degrees, shifts up to {} m", args.turn, args.shift));
+    card.row("mask of static objects", "supervised: pixels in annotated boxes are not static");
+    if let Some(accuracy) = summary.validation {
+        card.row("validation", text(&accuracy));
+    }
+    card.configuration(&summary.network);
+    card.write(&config.run.out)?;
+    let more = summary.validation.map_or(serde_json::json!({}), |DiffLocAccuracy { p50_m, success_3m }| {
+        serde_json::json!({"validation": {"p50_m": p50_m, "success_3m": success_3m}})
+    });
+    args.options.print(&summary.trained, &more)?;
+    Ok(())
+}
+
+impl Args {
+    fn config(&self) -> anyhow::Result<DiffLocTrainConfig> {
+        if !(0.0..=180.0).contains(&self.turn) {
+            return Err(bad(&format!("--turn is {}, must be 0 to 180 degrees", self.turn)));
+        }
+        if !(0.0..=10.0).contains(&self.shift) {
+            return Err(bad(&format!("--shift is {}, must be 0 to 10 metres", self.shift)));
+        }
+        check_folders(self.scenes.iter().chain(&self.validation))?;
+        let run = run_config(&self.options, self.batch, self.lr)?;
+        let optimizer =
+            AdamWConfig { weight_decay: WEIGHT_DECAY, max_gradient_norm: MAX_GRADIENT_NORM, ..run.optimizer };
+        Ok(DiffLocTrainConfig {
+            scenes: self.scenes.clone(),
+            validation: self.validation.clone(),
+            network: DiffLocConfig { scene_name: self.scene_name.clone(), ..DiffLocConfig::small() },
+            turn_rad: self.turn.to_radians(),
+            shift_m: self.shift,
+            run: RunConfig { optimizer, ..run },
+        })
+    }
+}
+
+fn show(bar: &TrainingBar, report: &DiffLocReport) {
+    match report {
+        DiffLocReport::Imaging(done, total) => bar.encoded(*done, *total),
+        DiffLocReport::Stepped { step, share_done, seconds, noise_l1, accuracy } => {
+            bar.report(*share_done, *seconds, &format!("step {step} noise {noise_l1:.4}, batch {}", text(accuracy)));
+        }
+        DiffLocReport::Validated(seconds, accuracy) => {
+            bar.print_line(&format!("{seconds:.0} s: validation {}", text(accuracy)));
+        }
+    }
+}
+
+fn text(accuracy: &DiffLocAccuracy) -> String {
+    format!("median {:.2} m, {:.1} % under 3 m", accuracy.p50_m, 100.0 * accuracy.success_3m)
+}

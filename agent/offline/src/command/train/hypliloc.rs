@@ -1,0 +1,58 @@
+//! `agent train hypliloc`: arguments, progress and model card.
+
+use std::path::PathBuf;
+
+use agent_offline::training::{HypLiLocReport, HypLiLocTrainConfig, train_hypliloc};
+use perception::train::{ModelCard, TrainingBar, TrainingOptions};
+
+use super::options::{check_folders, print_left_out, run_config};
+
+/// Train a small HypLiLoc on one scene; writes checkpoint, weights.safetensors and model-card.md.
+///
+/// All inputs lie on the device: 50 kB for each sweep. A length in minutes begins when they are computed.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// Folders of sweeps, all of the same scene.
+    #[arg(long, required = true, num_args = 1.., value_name = "DIR")]
+    scenes: Vec<PathBuf>,
+    /// Name of the scene, for messages and the model card.
+    #[arg(long, default_value = "scene")]
+    scene_name: String,
+    /// Sweeps per step.
+    #[arg(long, default_value_t = 128)]
+    batch: usize,
+    /// Highest learning rate.
+    #[arg(long, default_value_t = 1e-3)]
+    lr: f64,
+    #[command(flatten)]
+    options: TrainingOptions,
+}
+
+pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
+    check_folders(&args.scenes)?;
+    let config = HypLiLocTrainConfig {
+        scenes: args.scenes.clone(),
+        scene_name: args.scene_name.clone(),
+        run: run_config(&args.options, args.batch, args.lr)?,
+    };
+    let bar = TrainingBar::of(config.run.length);
+    let mut latest = None;
+    let trained = train_hypliloc(&config, &mut |report| match *report {
+        HypLiLocReport::Sampling(done, total) => bar.encoded(done, total),
+        HypLiLocReport::Stepped { step, share_done, seconds, error_m, error_deg } => {
+            latest = Some((error_m, error_deg));
+            bar.report(share_done, seconds, &format!("step {step} error {error_m:.2} m {error_deg:.1} deg"));
+        }
+    })?;
+    bar.finish();
+    print_left_out(&bar, &trained.data);
+    let title = format!("HypLiLoc, small, of {}", config.scene_name);
+    let mut card = ModelCard::new(&title, "Trained from random weights on the sweeps of one scene.");
+    card.trained(&config.run, &trained, "all sweeps", "sweeps");
+    if let Some((error_m, error_deg)) = latest {
+        card.row("mean error of the last steps, training sweeps", format!("{error_m:.2} m, {error_deg:.1} deg"));
+    }
+    card.write(&config.run.out)?;
+    args.options.print(&trained, &serde_json::json!({}))?;
+    Ok(())
+}

@@ -1,0 +1,58 @@
+//! Loss of DiffLoc: L1 of the predicted noise and of its differences between sweeps, and cross entropy of the mask.
+
+use tch::{Kind, Reduction, TchError, Tensor};
+
+use super::augmentation::{Augmented, static_tokens};
+use localization::competitors::diffloc::{CHANNELS, DiffLoc, Windows};
+
+/// Noise levels and noises that are drawn for each window: the denoiser costs little beside the encoder.
+const DRAWS: i64 = 8;
+/// Share of these whose sweeps do not see each other, as in the localization of a single sweep.
+const SINGLE: f64 = 0.5;
+/// Weight of the differences between sweeps.
+const DIFFERENCE_WEIGHT: f64 = 1.0;
+/// Weight of the mask of static objects.
+const MASK_WEIGHT: f64 = 0.1;
+
+/// Result of a batch.
+pub(super) struct Losses {
+    /// Weighted sum, with gradient.
+    pub(super) total: Tensor,
+    /// Mean L1 of the noise, without gradient.
+    pub(super) noise: Tensor,
+    /// `[W, F, width]`: features of the sweeps, without gradient.
+    pub(super) features: Tensor,
+}
+
+/// Losses of windows of `frames` sweeps, one after another.
+pub(super) fn losses(network: &DiffLoc, batch: &Augmented, frames: i64, kind: Kind) -> Result<Losses, TchError> {
+    let images = batch.images.f_narrow(1, 0, CHANNELS as i64)?.f_to_kind(kind)?;
+    let encoded = network.encoder().forward(&images, true)?;
+    let statics = static_tokens(&batch.images, network.config().patch)?;
+    let mask =
+        encoded.static_logits.f_binary_cross_entropy_with_logits::<Tensor>(&statics, None, None, Reduction::Mean)?;
+    let features = encoded.features.f_view([-1, frames, network.config().width])?;
+    let (differences, noise) = noise_losses(network, &features, &batch.poses.f_view([-1, frames, 5])?)?;
+    let total = &noise + differences * DIFFERENCE_WEIGHT + mask * MASK_WEIGHT;
+    Ok(Losses { total, noise: noise.f_detach()?, features: features.f_detach()? })
+}
+
+/// Loss of the differences between sweeps that see each other, and of the noise itself.
+fn noise_losses(network: &DiffLoc, features: &Tensor, poses: &Tensor) -> Result<(Tensor, Tensor), TchError> {
+    let drawn = |of: &Tensor| of.f_repeat([DRAWS, 1, 1]);
+    let (features, poses) = (drawn(features)?, drawn(poses)?);
+    let (count, frames, _) = poses.size3()?;
+    let on = (Kind::Float, poses.device());
+    let steps = Tensor::f_randint(network.schedule().steps(), [count], (Kind::Int64, on.1))?;
+    let noise = Tensor::f_randn(poses.size(), on)?;
+    let joint = Tensor::f_rand([count], on)?.f_ge(SINGLE)?.f_to_kind(Kind::Float)?;
+    let noisy = network.schedule().add_noise(&poses, &noise, &steps)?;
+    let error = network.denoiser().forward(&noisy, &steps, &features, Windows::Joint(&joint))?.f_sub(&noise)?;
+    let mean = error.f_abs()?.f_mean(Kind::Float)?;
+    if frames < 2 {
+        return Ok((mean.f_zeros_like()?, mean));
+    }
+    let differences =
+        error.f_diff::<Tensor>(1, 1, None, None)?.f_abs()?.f_mean_dim([1_i64, 2].as_slice(), false, Kind::Float)?;
+    Ok((differences.f_mul(&joint)?.f_mean(Kind::Float)?, mean))
+}

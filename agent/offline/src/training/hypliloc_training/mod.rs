@@ -1,0 +1,155 @@
+//! Training of HypLiLoc on the sweeps of one scene, all of whose inputs lie on the device of the network.
+
+mod augmentation;
+mod criterion;
+mod examples;
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::time::Instant;
+
+use tch::nn::VarStore;
+use tch::{Cuda, Kind, Tensor};
+
+use super::error::LocalizerTrainError;
+use localization::competitors::HypLiLocLocalizer;
+use localization::competitors::hypliloc::{HypLiLoc, HypLiLocConfig};
+use perception::train::{RunConfig, Trained, Trainer};
+use perception::weights::{CONFIG_KEY, KIND_KEY};
+
+use augmentation::augment;
+use criterion::{Criteria, mean_errors};
+use examples::Examples;
+
+/// Steps between two reports.
+const REPORT_EVERY: u64 = 20;
+/// Steps between two checkpoints.
+const CHECKPOINT_EVERY: u64 = 2000;
+
+/// Configuration of a training of HypLiLoc.
+#[derive(Debug, Clone)]
+pub struct HypLiLocTrainConfig {
+    /// Folders of sweeps, all of one scene.
+    pub scenes: Vec<PathBuf>,
+    /// Name of the scene.
+    pub scene_name: String,
+    /// Training run; a batch are sweeps. Its time begins when all inputs are computed.
+    pub run: RunConfig,
+}
+
+/// Progress of a training of HypLiLoc.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum HypLiLocReport {
+    /// Inputs are being computed: number of sweeps done and of all.
+    Sampling(usize, usize),
+    /// Some steps are done.
+    Stepped {
+        /// Number of steps done.
+        step: u64,
+        /// Share of the training that is done, 0..1.
+        share_done: f64,
+        /// Seconds spent.
+        seconds: f64,
+        /// Mean position error of the fusion since the last report, metres.
+        error_m: f64,
+        /// Mean heading error of the fusion since the last report, degrees.
+        error_deg: f64,
+    },
+}
+
+/// Trains a network; writes checkpoint and weights into `config.run.out`.
+///
+/// # Errors
+/// [`LocalizerTrainError`].
+pub fn train_hypliloc(
+    config: &HypLiLocTrainConfig,
+    observe: &mut dyn FnMut(&HypLiLocReport),
+) -> Result<Trained, LocalizerTrainError> {
+    let run = &config.run;
+    run.start()?;
+    let examples = Examples::read(&config.scenes, run, &mut |done, all| observe(&HypLiLocReport::Sampling(done, all)))?;
+    let variables = VarStore::new(run.device);
+    let network = HypLiLoc::new(&variables.root());
+    let criteria = Criteria::new(&(variables.root() / "criteria"));
+    let mut trainer = Trainer::begin(run, &variables, None, Instant::now())?;
+    // The tensor library draws all random numbers of a step, on the device.
+    tch::manual_seed(run.seed.wrapping_add(trainer.steps()) as i64);
+    Cuda::cudnn_set_benchmark(run.device.is_cuda());
+    let share_done =
+        |trainer: &Trainer| trainer.share_done((trainer.steps() * run.batch as u64) as f64 / examples.len() as f64);
+    let mut errors = Tensor::f_zeros([2], (Kind::Float, run.device))?;
+    while share_done(&trainer) < 1.0 {
+        let (batch, truth) = augment(examples.draw(run.batch as i64)?)?;
+        let poses = network.forward(&batch, run.precision.kind(), true)?;
+        let loss = criteria.loss(&poses, &truth)?;
+        trainer.step(&loss, share_done(&trainer))?;
+        errors += mean_errors(&poses.fusion, &truth, &examples.scale_m)?;
+        let step = trainer.steps();
+        if step.is_multiple_of(REPORT_EVERY) {
+            let mean: Vec<f64> = Vec::try_from(&(&errors / REPORT_EVERY as f64).f_to_kind(Kind::Double)?)?;
+            let _ = errors.f_zero_()?;
+            let share_done = share_done(&trainer).min(1.0);
+            let (error_m, error_deg) = (mean[0], mean[1].to_degrees());
+            observe(&HypLiLocReport::Stepped { step, share_done, seconds: trainer.seconds(), error_m, error_deg });
+        }
+        if step.is_multiple_of(CHECKPOINT_EVERY) {
+            trainer.checkpoint(&variables)?;
+        }
+    }
+    trainer.checkpoint(&variables)?;
+    let network_config = HypLiLocConfig {
+        scene_name: config.scene_name.clone(),
+        origin_m: examples.origin_m,
+        scale_m: examples.deviation_m,
+    };
+    let about = BTreeMap::from([
+        (CONFIG_KEY.to_owned(), serde_json::to_string(&network_config).expect("a configuration is JSON")),
+        (KIND_KEY.to_owned(), HypLiLocLocalizer::KIND.to_owned()),
+    ]);
+    Ok(trainer.save_weights(&variables, about, examples.data)?)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use localization::competitors::load_competitor;
+    use localization::pgc::pose_solver::PoseSolver;
+    use perception::train::Length;
+    use protocol::PointCloud;
+    use simulator::generate::{Subset, SynthOptions, generate};
+    use tch::Device;
+
+    use super::*;
+
+    fn config(scene: &Path, out: &Path, steps: u64) -> HypLiLocTrainConfig {
+        let run = RunConfig { batch: 2, ..RunConfig::new(Length::Steps(steps), out) };
+        HypLiLocTrainConfig { scenes: vec![scene.to_owned()], scene_name: "small".into(), run }
+    }
+
+    #[test]
+    fn a_training_is_resumed_and_its_weights_are_opened_by_their_kind() {
+        tch::set_num_threads(1);
+        let folder = tempfile::tempdir().unwrap();
+        let (scene, out) = (folder.path().join("scene"), folder.path().join("out"));
+        let drive = SynthOptions { frames: 2, ..SynthOptions::new(Subset::Town1loc, 400, scene.clone()) };
+        generate(&drive, &|_| ()).unwrap();
+        let mut sampled = 0;
+        let mut observe = |report: &HypLiLocReport| {
+            if let HypLiLocReport::Sampling(done, _) = report {
+                sampled = *done;
+            }
+        };
+        assert_eq!(train_hypliloc(&config(&scene, &out, 2), &mut observe).unwrap().steps, 2);
+        assert!(sampled >= 2, "{sampled}");
+        let mut resumed = config(&scene, &out, 3);
+        resumed.run.resume = true;
+        let trained = train_hypliloc(&resumed, &mut |_| ()).unwrap();
+        assert_eq!(trained.steps, 3);
+        assert!(trained.weights.metadata().unwrap().len() < 10_000_000);
+        let mut localizer = load_competitor(&trained.weights, Device::Cpu, PoseSolver::default()).unwrap();
+        let wall = (0..4000).map(|k| [(k % 60) as f32 - 30.0, 9.0, (k / 60) as f32 * 0.1, 0.2]);
+        let answer = localizer.localize(&PointCloud { xyzi: wall.collect() }).unwrap();
+        assert!(answer.estimate.world_from_cav().is_some(), "{answer:?}");
+    }
+}
