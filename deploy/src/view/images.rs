@@ -1,6 +1,6 @@
 //! Newest image of every camera of a live run, kept while a page asks for them.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -30,11 +30,6 @@ impl NewestImages {
         let mut state = self.lock();
         state.asked = Some(Instant::now());
         state.images.get(&(cav.clone(), number)).cloned()
-    }
-
-    /// Numbers of the cameras whose images are kept.
-    pub(super) fn cameras(&self) -> BTreeSet<u8> {
-        self.lock().images.keys().map(|(_, number)| *number).collect()
     }
 
     /// True while pages ask for images; afterwards those that are kept are forgotten.

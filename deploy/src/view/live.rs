@@ -1,6 +1,5 @@
 //! Live run: follows the newest scene frame.
 
-use std::collections::BTreeSet;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::{self, JoinHandle};
@@ -44,17 +43,15 @@ pub struct LiveRun {
     thread: Option<JoinHandle<()>>,
 }
 
-/// Status of a live run: time since its last message, end, connection, cameras.
+/// Status of a live run: time since its last message, end, connection.
 #[derive(Debug, Clone, Serialize)]
 pub(super) struct RunStatus {
-    /// Time since the last message, seconds; `None`: there was none since a page is open.
+    /// Time since the last message of the scene, seconds; `None`: there was none since a page is open.
     pub(super) silent_s: Option<f64>,
     /// True if its scene has been played to the end.
     pub(super) is_over: bool,
     /// True while there is a connection to its router.
     pub(super) has_router: bool,
-    /// Numbers of the cameras whose images have arrived.
-    pub(super) cameras: BTreeSet<u8>,
 }
 
 /// State behind [`RunStatus`].
@@ -104,7 +101,6 @@ impl LiveRun {
             silent_s: activity.last_message.map(|at| at.elapsed().as_secs_f64()),
             is_over: activity.is_over,
             has_router: activity.has_router,
-            cameras: self.images.cameras(),
         }
     }
 
@@ -246,7 +242,11 @@ impl Listener {
         self.newest.receiver_count() > 0
     }
 
+    /// Reports of processes are no activity: a viewer reports too, for as long as its page is open.
     fn note(&self, topic: &Topic) {
+        if let Topic::Stats(_) = topic {
+            return;
+        }
         let mut activity = self.activity();
         activity.last_message = Some(Instant::now());
         match topic {

@@ -3,11 +3,10 @@
 use std::io;
 use std::net::SocketAddr;
 use std::sync::Arc;
-use std::time::Duration;
 
 use bus::web::{Answer, Request, WebServer};
 use bytes::Bytes;
-use futures_util::{StreamExt, stream};
+use futures_util::StreamExt;
 use protocol::{CavId, ImageFormat};
 use serde_json::json;
 
@@ -26,8 +25,8 @@ const SCRIPTS: [(&str, &str); 4] = [
 /// Content type of scene frames.
 const BINARY: &str = "application/octet-stream";
 
-/// Longest delay of a page's load.
-const LONGEST_HOLD: Duration = Duration::from_secs(10);
+/// Shown until the first image of a camera has arrived: it is received once a page asks for it.
+const NO_IMAGE_YET: &str = r#"<svg xmlns="http://www.w3.org/2000/svg" width="16" height="10"/>"#;
 
 /// Serves the page of a live run until dropped.
 ///
@@ -40,22 +39,16 @@ pub fn serve_live(address: SocketAddr, run: Arc<LiveRun>) -> io::Result<WebServe
             Answer::Stream { content_type: BINARY, pieces: run.moments(number_of("frames", &request.query)).boxed() }
         }
         "/status" => document(&json!(run.status())),
-        "/hold" => hold(&request.query),
         path => match camera(path) {
-            Some((cav, number)) => image(run.images().get(&cav, number)),
+            Some((cav, number)) => match run.images().get(&cav, number) {
+                None => {
+                    Answer::Page { content_type: "image/svg+xml", body: Bytes::from_static(NO_IMAGE_YET.as_bytes()) }
+                }
+                found => image(found),
+            },
             None => asset(request),
         },
     })
-}
-
-/// An empty script with a delay, by which a page defers its load event.
-fn hold(query: &str) -> Answer {
-    let time = Duration::from_millis(number_of("ms", query).unwrap_or(0)).min(LONGEST_HOLD);
-    let wait = async move {
-        tokio::time::sleep(time).await;
-        Bytes::new()
-    };
-    Answer::Stream { content_type: "text/javascript", pieces: stream::once(wait).boxed() }
 }
 
 /// Serves the page of a recorded run until dropped.

@@ -8,14 +8,14 @@ use super::table::{NOTES, rows};
 use super::varying::VaryingTable;
 
 const STYLE: &str = "body{font:16px/1.5 system-ui,sans-serif;margin:2rem auto;max-width:72rem;padding:0 1rem;\
-    color:#282c34;overflow-wrap:anywhere}h1{font-size:1.5rem}h2{font-size:1.15rem;margin-top:2rem}svg{width:100%;min-width:34rem;height:auto}figure{margin:1rem 0;overflow-x:auto}\
+    color:#282c34;overflow-wrap:anywhere}h1{font-size:1.5rem}h2{font-size:1.15rem;margin-top:2rem}svg{flex:1 1 20rem;min-width:0;height:auto}figure{margin:1rem 0;display:flex;flex-wrap:wrap}\
     .wide{overflow-x:auto}table{border-collapse:collapse;font-size:.8rem;white-space:nowrap}\
     th,td{padding:.2rem .6rem;text-align:right;border-bottom:1px solid #e2e5ea}th{position:sticky;top:0;background:#fff}\
     pre{background:#f5f6f8;padding:1rem;overflow-x:auto;font-size:.85rem}dt{font-weight:600}dd{margin:0 0 .4rem 1rem}";
 
-/// Page of an experiment with the file content `spec` and the SVG of its figures.
+/// Page of an experiment with the file content `spec` and the SVG of the charts of each figure.
 // Writing to a string cannot fail.
-pub(super) fn page(experiment: &Experiment, spec: &str, cells: &[Cell], figures: &[String]) -> String {
+pub(super) fn page(experiment: &Experiment, spec: &str, cells: &[Cell], figures: &[Vec<String>]) -> String {
     let title = if experiment.title.is_empty() { &experiment.name } else { &experiment.title };
     let mut page = format!(
         "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">\n\
@@ -38,7 +38,7 @@ pub(super) fn page(experiment: &Experiment, spec: &str, cells: &[Cell], figures:
         let _ = writeln!(page, "<p>{}</p>", escaped(&sentence));
     }
     for figure in figures {
-        let _ = writeln!(page, "<figure>{figure}</figure>");
+        let _ = writeln!(page, "<figure>{}</figure>", figure.concat());
     }
     page += &runs_table(&table);
     page += "<h2>Columns</h2>\n<dl>\n";

@@ -315,7 +315,9 @@ impl Sweep {
         for figure in charts::figures(&self.experiment, cells) {
             let svg = figures::svg(&figure.charts)?;
             write(&format!("{}.svg", figure.name), &svg)?;
-            drawings.push(svg);
+            // Charts of their own: side by side where there is room, and else below each other.
+            let each = figure.charts.chunks(1).map(figures::svg).collect::<Result<Vec<_>, _>>()?;
+            drawings.push(each);
             figures::save_png(&figure.charts, &self.out.join(format!("{}.png", figure.name)))?;
         }
         let spec =

@@ -13,7 +13,7 @@ function hint(text) {
 
 /// Live: frames as they arrive, each after its length; the server keeps only the newest for each page.
 async function live() {
-  const answer = await fetch(`live${location.search}`);
+  const answer = await fetch("live");
   const reader = answer.body.getReader();
   let rest = new Uint8Array(0);
   state("live", "live");
@@ -33,7 +33,7 @@ async function live() {
       rest = rest.slice(4 + length);
     }
     // An error in here is one of the page, and not the end of the run.
-    try { if (newest) show(newest.buffer); } catch (error) { fail(String(error)); }
+    try { if (newest) show(parse(newest.buffer)); } catch (error) { fail(String(error)); }
   }
 }
 
@@ -41,32 +41,49 @@ async function watch() {
   setInterval(check, 1000);
   for (;;) {
     await live().catch(() => {});
-    state("ended", still ? "live, stopped" : "v2vloc view is gone; trying again");
-    if (still) return;
+    state("ended", "v2vloc view is gone; trying again");
     await new Promise((resolve) => setTimeout(resolve, 2000));
   }
 }
-
-let probes = 0;
 
 /// State of the live run: going on, over, or out of reach.
 async function check() {
   const answer = await fetch("status").catch(() => null);
   if (!answer || !answer.ok) return;
-  const { silent_s: silent, is_over: over, has_router: router, cameras } = await answer.json();
-  if (cameras.length) view.cameras = cameras;
-  // Images are received only while somebody asks for them: asked once in a while whether there are any.
-  else if (view.frame && view.frame.ego && probes++ % 30 === 0) fetch(`camera/${view.frame.ego}/0`).catch(() => {});
+  const { silent_s: silent, is_over: over, has_router: router } = await answer.json();
   const before = isKnown(silent) ? ` ${seconds(silent)} ago` : "";
-  if (!router && !over) state("ended", before ? `router gone, last message${before}` : "router gone");
-  else if (over && silent > 2) state("ended", `ended${before}`);
+  if (over && silent > 2) state("over", `ended${before}${router ? "" : ", router gone"}`);
+  else if (!router) state("ended", before ? `router gone, last message${before}` : "router gone");
   else if (!isKnown(silent)) state("waiting", "waiting for the run");
   else if (silent > 3) state("ended", `last message${before}`);
   else state("live", "live");
   if (!isKnown(silent)) hint("Nothing is published in this run yet.");
 }
 
-const tape = { timeline: [], at: -1, wanted: 0, busy: false, playing: null };
+const tape = { timeline: [], at: -1, wanted: 0, busy: false, playing: null, linking: null };
+
+async function moment(index) {
+  const answer = await fetch(`frame/${index}`);
+  if (!answer.ok) throw new Error(await answer.text());
+  return parse(await answer.arrayBuffer());
+}
+
+/// The last result until a moment, which is shown where there is none: the same on every way to it.
+async function resultUntil(index) {
+  const isAnswered = (at) => tape.timeline[at].latency_ms !== null;
+  if (isAnswered(index)) return;
+  let at = index - 1;
+  while (at >= 0 && !isAnswered(at)) at -= 1;
+  const known = view.answered && view.answered.capture_s;
+  if (at < 0) view.answered = null;
+  else if (known !== tape.timeline[at].capture_s) view.answered = (await moment(at)).frame;
+}
+
+/// A link to the moment in the address; late, as browsers limit how often that may change.
+function link(index) {
+  clearTimeout(tape.linking);
+  tape.linking = setTimeout(() => history.replaceState(null, "", `#at=${index}`), 200);
+}
 
 /// Recorded: one frame at a time; during a fetch only the last request counts.
 async function seek(index) {
@@ -77,13 +94,12 @@ async function seek(index) {
   try {
     while (tape.at !== tape.wanted) {
       const next = tape.wanted;
-      const answer = await fetch(`frame/${next}`);
-      if (!answer.ok) throw new Error(await answer.text());
-      show(await answer.arrayBuffer());
+      const found = await moment(next);
+      await resultUntil(next);
       tape.at = next;
       $("moment").textContent = `${next + 1} of ${tape.timeline.length}`;
-      // A link to this moment.
-      history.replaceState(null, "", `#at=${next}`);
+      show(found);
+      link(next);
       spark();
     }
   } finally {
@@ -124,11 +140,11 @@ function spark() {
   pen.fillStyle = colour("--faint");
   pen.font = "11px system-ui, sans-serif";
   const gaps = times.filter((time) => time === null).length;
-  pen.fillText(`latency, up to ${ms(most)}${gaps ? `; ${gaps} ticks without a result (marks at the bottom)` : ""}`, 8, 10);
+  pen.fillText(`latency, up to ${ms(most)}${gaps ? `; red: ${gaps} ticks without a result` : ""}`, 8, 10);
   const bar = Math.max(1, Math.min(10, (width - 16) / times.length - 1));
   times.forEach((time, index) => {
-    pen.fillStyle = time === null ? colour("--wrong") : colour("--accent");
-    pen.globalAlpha = index === tape.at ? 1 : 0.45;
+    pen.fillStyle = time === null ? colour("--bad") : colour("--ink");
+    pen.globalAlpha = index === tape.at ? 1 : 0.35;
     const top = time === null ? height - 7 : y(time);
     pen.fillRect(x(index) - bar / 2, top, bar, height - 4 - top);
   });
@@ -157,11 +173,12 @@ async function begin() {
   $("ahead").addEventListener("click", () => { play(false); seek(tape.wanted + 1); });
   $("worst").addEventListener("click", () => { play(false); seek(worst()); });
   addEventListener("keydown", (event) => {
-    const isSlider = event.target.id === "seek";
-    if (["BUTTON", "SELECT", "INPUT", "SUMMARY"].includes(event.target.tagName) && !isSlider) return;
-    if (event.key === " ") { event.preventDefault(); play(!tape.playing); }
-    if (event.key === "ArrowRight") { event.preventDefault(); seek(tape.wanted + 1); }
-    if (event.key === "ArrowLeft") { event.preventDefault(); seek(tape.wanted - 1); }
+    const { id, tagName } = event.target;
+    if (["SELECT", "INPUT"].includes(tagName) && id !== "seek") return;
+    // A button is pressed by space itself.
+    if (event.key === " " && !["BUTTON", "SUMMARY"].includes(tagName)) { event.preventDefault(); play(!tape.playing); }
+    if (event.key === "ArrowRight") { event.preventDefault(); play(false); seek(tape.wanted + 1); }
+    if (event.key === "ArrowLeft") { event.preventDefault(); play(false); seek(tape.wanted - 1); }
   });
   addEventListener("hashchange", () => seek(asked()));
   state("recorded", "recorded");

@@ -22,17 +22,17 @@ function facts(frame) {
 }
 
 function panels(frame) {
-  const skipped = !frame.ego;
   const last = view.answered || frame;
-  $("vehicles").replaceChildren(...frame.vehicles.map((vehicle) => vehicleCard(vehicle, last.ego, skipped)));
+  $("vehicles").replaceChildren(...frame.vehicles.map((vehicle) => vehicleCard(vehicle, last.ego)));
   legend(frame);
   cameras(frame);
   card();
+  const hasTrust = last.links.some((link) => isKnown(link.trust));
   table("links", [["from"], ["latency", "From publication to arrival at the ego"], ["size", "Bytes of all its messages for this frame"],
     ["age", "Capture of the ego's sweep minus that of the neighbour's"], ["clock", "Offset of the neighbour's clock from the ego's, as estimated"],
-    ["trust", "Trust score, with misbehaviour detection"], [""]],
+    ...(hasTrust ? [["trust", "Trust score of misbehaviour detection"]] : []), [""]],
   last.links.map((link) => [
-    link.from, ms(link.latency_ms), bytes(link.wire_bytes), ms(link.age_ms), ms(link.clock_ms), number(link.trust, 2),
+    link.from, ms(link.latency_ms), bytes(link.wire_bytes), ms(link.age_ms), ms(link.clock_ms), ...(hasTrust ? [number(link.trust, 2)] : []),
     link.is_fused ? "fused" : [[link.skipped || "silent", link.misbehaviour].filter(Boolean).map(words).join(": "), "bad"],
   ]), last.ego ? "No neighbour sends to the ego." : "No result yet.");
   stages(last);
@@ -49,13 +49,12 @@ function sigma(vehicle) {
   return vehicle.confidence > 0 ? Math.sqrt(1 / vehicle.confidence - 1) : null;
 }
 
-function vehicleCard(vehicle, egoCav, skipped) {
+function vehicleCard(vehicle, egoCav) {
   const isEgo = vehicle.cav === egoCav;
-  const known = isKnown(vehicle.confidence);
-  let status = "no pose";
-  if (known) status = `σ ${metres(sigma(vehicle))}`;
+  // Without a message it has left out the tick, and only a refusal is "no pose".
+  let status = "tick left out";
+  if (isKnown(vehicle.confidence)) status = `σ ${metres(sigma(vehicle))}`;
   else if (vehicle.no_pose) status = `no pose: ${words(vehicle.no_pose)}`;
-  else if (skipped) status = "tick left out";
   const error = isKnown(vehicle.error_m) ? `, ${metres(vehicle.error_m)} off` : "";
   const isChosen = view.chosen && view.chosen.cav === vehicle.cav;
   return element("button", {
@@ -103,11 +102,17 @@ function card() {
 
 function choose(what) {
   view.chosen = what;
+  // On a phone there is room for one of the two.
+  if (what && isPhone.matches) $("legendbox").open = false;
   refresh();
 }
 
-/// Images of the selected vehicle, or of the ego.
+/// Images of the selected vehicle, or of the ego. The cameras of a live run are those of its message counters.
 function cameras(frame) {
+  if (!tape.timeline.length) {
+    const numbers = frame.messages.flatMap(({ topic }) => /\/camera\/(\d+)$/.exec(topic)?.[1] ?? []);
+    view.cameras = [...new Set(numbers)].sort();
+  }
   const chosen = (view.chosen && view.chosen.cav) || (view.answered && view.answered.ego) || (frame.vehicles[0] && frame.vehicles[0].cav);
   $("cameras").hidden = !view.cameras.length || !chosen;
   if ($("cameras").hidden) return;
@@ -228,4 +233,5 @@ $("score").addEventListener("input", () => {
   $("scoretext").textContent = number(view.score, 2);
   refresh();
 });
-if (matchMedia("(max-width: 860px)").matches) $("legendbox").open = false;
+const isPhone = matchMedia("(max-width: 860px)");
+if (isPhone.matches) $("legendbox").open = false;

@@ -79,7 +79,8 @@ function rings(pen, middle, width, height) {
     pen.beginPath();
     pen.arc(middle[0], middle[1], radius * view.zoom, 0, 2 * Math.PI);
     pen.stroke();
-    pen.fillText(`${radius} m`, middle[0], middle[1] - radius * view.zoom - 4);
+    const label = middle[1] - radius * view.zoom - 4;
+    if (label > 12) pen.fillText(`${radius} m`, middle[0], label);
   }
 }
 

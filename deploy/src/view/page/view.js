@@ -13,14 +13,6 @@ function fail(words) {
   root.dataset.error = words;
 }
 
-// Screenshot of a live run (`?frames=N`): the page counts as loaded only after the time of so many frames.
-const still = /frames=(\d+)/.exec(location.search);
-if (still) {
-  const hold = document.createElement("script");
-  hold.src = `hold?ms=${100 * Number(still[1]) + 1500}`;
-  document.body.append(hold);
-}
-
 // ---- formatting of numbers; what is not known is a dash, never a zero ----
 
 const isKnown = (value) => value !== null && value !== undefined;
@@ -67,12 +59,15 @@ const ink = (cav) => colour(swatch(cav).slice(4, -1));
 const ego = (frame) => frame.vehicles.find((vehicle) => vehicle.cav === frame.ego);
 
 /// A scene frame: a JSON document after its length, then three 16-bit numbers per point.
-function show(buffer) {
+function parse(buffer) {
   const length = new DataView(buffer).getUint32(0, true);
   const frame = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));
-  const raw = buffer.slice(4 + length);
+  return { frame, points: new Int16Array(buffer.slice(4 + length)) };
+}
+
+function show({ frame, points }) {
   view.frame = frame;
-  view.points = new Int16Array(raw);
+  view.points = points;
   if (frame.ego) view.answered = frame;
   else if (view.answered && view.answered.capture_s > frame.capture_s) view.answered = null;
   const own = ego(frame) || (view.answered && frame.vehicles.find((vehicle) => vehicle.cav === view.answered.ego)) || frame.vehicles[0];
