@@ -4,12 +4,12 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
+use dataset::average_precision::{Ordering, Scorer};
 use protocol::{Box3d, Detection};
 use serde_json::Value;
 use simulator::generate::{Subset, SynthOptions, generate};
 use tests::fleet::{Up, programs, results, write_scenario};
 use tests::locks::exclusive_lock;
-use training::average_precision::{Ordering, Scorer};
 
 const FRAMES: usize = 3;
 
