@@ -4,7 +4,7 @@ use std::f64::consts::TAU;
 
 use tch::{Kind, TchError, Tensor};
 
-use super::images::{Normalisation, Windows};
+use super::images::{Normalisation, SweepBatch};
 use localization::competitors::diffloc::{CHANNELS, RangeImageConfig, UNITS};
 
 /// Deviation of the relative error of a range.
@@ -42,7 +42,7 @@ impl Augmentation {
     /// Changes windows of `frames` sweeps each; the sensor of a window is turned and moved alike in all of its sweeps.
     pub(super) fn apply(
         &self,
-        windows: &Windows,
+        windows: &SweepBatch,
         frames: i64,
         normalisation: &Normalisation,
     ) -> Result<Augmented, TchError> {

@@ -39,11 +39,11 @@ pub(super) struct Normalisation {
     pub(super) scale_m: [f64; 3],
 }
 
-/// A batch as it is stored.
-pub(super) struct Windows {
-    /// `[W * F, STORED_CHANNELS, rows, columns]`, half precision.
+/// Some sweeps as they are stored.
+pub(super) struct SweepBatch {
+    /// `[N, STORED_CHANNELS, rows, columns]`, half precision.
     pub(super) images: Tensor,
-    /// `[W * F, 5]`.
+    /// `[N, 5]`.
     pub(super) poses: Tensor,
 }
 
@@ -102,20 +102,20 @@ impl SweepImages {
     }
 
     /// Some images `[N, STORED_CHANNELS, rows, columns]` and poses `[N, 5]`, one after another.
-    pub(super) fn narrow(&self, first: i64, count: i64) -> Result<Windows, TchError> {
-        Ok(Windows { images: self.images.f_narrow(0, first, count)?, poses: self.poses.f_narrow(0, first, count)? })
+    pub(super) fn narrow(&self, first: i64, count: i64) -> Result<SweepBatch, TchError> {
+        Ok(SweepBatch { images: self.images.f_narrow(0, first, count)?, poses: self.poses.f_narrow(0, first, count)? })
     }
 
     /// `count` random windows of `frames` sweeps of a drive, oldest first, equally far apart; where a drive has just
     /// begun, its first sweep several times.
-    pub(super) fn draw(&self, count: i64, frames: i64) -> Result<Windows, TchError> {
+    pub(super) fn draw(&self, count: i64, frames: i64) -> Result<SweepBatch, TchError> {
         let on = (Kind::Int64, self.images.device());
         let last = Tensor::f_randint(self.len(), [count, 1], on)?;
         let skip = Tensor::f_randint_low(1, LONGEST_SKIP + 1, [count, 1], on)?;
         let back = Tensor::f_arange_start_step(frames - 1, -1, -1, on)?;
         let first = self.first_of_drive.f_index_select(0, &last.f_view([-1])?)?.f_view([-1, 1])?;
         let rows = last.f_sub(&skip.f_mul(&back)?)?.f_maximum(&first)?.f_view([-1])?;
-        Ok(Windows { images: self.images.f_index_select(0, &rows)?, poses: self.poses.f_index_select(0, &rows)? })
+        Ok(SweepBatch { images: self.images.f_index_select(0, &rows)?, poses: self.poses.f_index_select(0, &rows)? })
     }
 }
 
