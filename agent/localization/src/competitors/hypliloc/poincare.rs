@@ -31,7 +31,7 @@ pub(super) fn logmap0(point: &Tensor) -> Result<Tensor, TchError> {
 
 /// Norms along the last dimension, in units of the radius.
 fn scaled_norm(x: &Tensor) -> Result<Tensor, TchError> {
-    Ok((x.f_square()?.f_sum_dim_intlist(-1_i64, true, Kind::Float)? * CURVATURE).f_add_scalar(TINY)?.f_sqrt()?)
+    (x.f_square()?.f_sum_dim_intlist(-1_i64, true, Kind::Float)? * CURVATURE).f_add_scalar(TINY)?.f_sqrt()
 }
 
 #[cfg(test)]
