@@ -39,6 +39,8 @@ pub(crate) struct Listener {
     settle: Duration,
     frames: LiveFrames,
     last_message: Instant,
+    /// The same without status messages.
+    last_data: Instant,
     messages: u64,
     undecodable: u64,
     problems: Vec<String>,
@@ -61,31 +63,38 @@ enum Step {
 }
 
 impl Listener {
-    /// The next message; waits without Python's lock, and lets Ctrl-C interrupt.
-    fn step(&mut self, py: Python<'_>) -> PyResult<Step> {
+    /// The next message, waiting for one so long: without Python's lock, and such that Ctrl-C interrupts.
+    fn step(&mut self, py: Python<'_>, wait: Duration) -> PyResult<Step> {
         py.check_signals()?;
-        let Some(Connection { subscriber, .. }) = &self.connection else { return Ok(Step::End) };
-        match py.detach(|| subscriber.take(Some(Instant::now() + POLL))) {
-            Pop::Item(_, message) => {
-                self.last_message = Instant::now();
-                if matches!(message.key.topic, Topic::Control(Verb::End)) {
-                    self.is_over = true;
-                } else if !matches!(message.key.topic, Topic::Control(_)) {
-                    self.messages += 1;
-                }
+        let Some(Connection { bus, subscriber }) = &self.connection else { return Ok(Step::End) };
+        let has_ended = self.is_over && self.last_data.elapsed() >= self.settle;
+        let wait = if has_ended { Duration::ZERO } else { wait };
+        match py.detach(|| subscriber.take(Some(Instant::now() + wait))) {
+            // Its own status is no sign that the run is there.
+            Pop::Item(Topic::Stats(process), _) if process == *bus.stats().process() => self.silence(),
+            Pop::Item(topic, message) => {
+                self.note(&topic);
                 Ok(Step::Message(message))
             }
             Pop::Closed => Ok(Step::End),
+            Pop::TimedOut if has_ended => Ok(Step::End),
             Pop::TimedOut => self.silence(),
+        }
+    }
+
+    fn note(&mut self, topic: &Topic) {
+        self.last_message = Instant::now();
+        self.is_over |= *topic == Topic::Control(Verb::End);
+        self.messages += u64::from(!matches!(topic, Topic::Control(_)));
+        // Processes that outlive the replay go on with their status.
+        if !matches!(topic, Topic::Stats(_)) {
+            self.last_data = Instant::now();
         }
     }
 
     /// Nothing has arrived: the end, or a run that is not there.
     fn silence(&self) -> PyResult<Step> {
         let silent = self.last_message.elapsed();
-        if self.is_over && silent >= self.settle {
-            return Ok(Step::End);
-        }
         match self.timeout {
             Some(timeout) if silent >= timeout && self.messages == 0 => Err(error(format!(
                 "no message of run {:?} at {} within {:.1} s: `v2vloc status` lists runs",
@@ -108,7 +117,7 @@ impl Listener {
 
     fn next_message(&mut self, py: Python<'_>) -> PyResult<Option<Message>> {
         loop {
-            let message = match self.step(py)? {
+            let message = match self.step(py, POLL)? {
                 Step::Message(message) if message.key.topic.is_json() => continue,
                 Step::Message(message) => message,
                 Step::Waiting => continue,
@@ -147,13 +156,16 @@ impl Listener {
             if let Some(parts) = self.frames.next() {
                 return Frame::new(py, parts).map(Some);
             }
-            match self.step(py)? {
+            // A loop that is slow finds messages in the queue that belong to frames which look complete.
+            let is_settled = self.frames.is_settled();
+            match self.step(py, if is_settled { Duration::ZERO } else { POLL })? {
                 Step::Message(message) if is_part_of_frames(&message.key.topic) => {
                     let frames = &mut self.frames;
                     if let Err(cause) = py.detach(|| frames.add(&message)) {
                         self.reject(&message.key, &cause);
                     }
                 }
+                Step::Waiting if is_settled => self.frames.hand_over_oldest(),
                 Step::Message(_) | Step::Waiting => {}
                 Step::End => {
                     self.frames.finish();
@@ -276,6 +288,7 @@ pub(crate) fn listen(
         timeout,
         settle,
         last_message: Instant::now(),
+        last_data: Instant::now(),
         messages: 0,
         undecodable: 0,
         problems: Vec::new(),

@@ -76,11 +76,13 @@ impl LiveFrames {
 
     /// The next frame that is complete.
     pub(crate) fn next(&mut self) -> Option<FrameParts> {
-        let oldest = self.pending.first_key_value();
-        if oldest.is_some_and(|(_, pending)| pending.last_message.elapsed() >= self.settle) {
-            self.hand_over_oldest();
-        }
         self.ready.pop_front()
+    }
+
+    /// True if the oldest frame has had no message for a while.
+    pub(crate) fn is_settled(&self) -> bool {
+        let oldest = self.pending.first_key_value();
+        oldest.is_some_and(|(_, pending)| pending.last_message.elapsed() >= self.settle)
     }
 
     /// No message follows: all frames are complete.
@@ -90,7 +92,8 @@ impl LiveFrames {
         }
     }
 
-    fn hand_over_oldest(&mut self) {
+    /// The oldest frame is complete.
+    pub(crate) fn hand_over_oldest(&mut self) {
         if let Some((at, pending)) = self.pending.pop_first() {
             self.handed_over = Some(at);
             self.ready.push_back(pending.parts);

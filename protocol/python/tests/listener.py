@@ -71,6 +71,7 @@ def test_a_certificate_permits_its_streams(run):
 def test_a_silent_run_ends_and_ctrl_c_interrupts(run):
     endpoint = free_endpoint()
     with background("v2vloc", "router", "--listen", endpoint):
+        v2vloc.listen(endpoint, run="empty").close()  # the router is there
         counted = other_thread_counts(lambda: refuses(
             lambda: next(v2vloc.listen(endpoint, run="empty", timeout_s=1)), "no message of run \"empty\""))
         assert counted > 20, f"another thread ran {counted} times"
@@ -93,7 +94,9 @@ def other_thread_counts(action) -> int:
 
     thread = threading.Thread(target=count)
     thread.start()
-    action()
-    is_over.set()
-    thread.join()
+    try:
+        action()
+    finally:
+        is_over.set()
+        thread.join()
     return len(steps)
