@@ -185,4 +185,7 @@ async function begin() {
   await seek(asked());
 }
 
+addEventListener("resize", () => { draw(); spark(); });
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { draw(); spark(); });
+
 begin().catch((error) => { fail(String(error)); state("ended", "no answer from v2vloc view"); });
