@@ -96,7 +96,8 @@ class Tab:
     `script` runs before those of the page. `files` maps paths of the server to local files that are shown instead.
     """
 
-    def __init__(self, browser: Chromium, width: int, height: int, script: str = "", files: dict[str, pathlib.Path] | None = None):
+    def __init__(self, browser: Chromium, width: int, height: int, script: str = "",
+                 files: dict[str, pathlib.Path] | None = None):
         self.browser, self.width, self.height = browser, width, height
         self.problems: list[str] = []
         self.files = files or {}
@@ -183,8 +184,8 @@ class Tab:
 
     def box(self, selector: str) -> tuple[float, float, float, float]:
         """Left, top, width and height of an element in the window."""
-        box = f"(({{x, y, width, height}}) => [x, y, width, height])(document.querySelector({json.dumps(selector)}).getBoundingClientRect())"
-        return tuple(self.value(box))
+        box = self.value(f"document.querySelector({json.dumps(selector)}).getBoundingClientRect().toJSON()")
+        return box["x"], box["y"], box["width"], box["height"]
 
     def slide(self, selector: str, share: float) -> None:
         """Drags the thumb of a slider to a share of its way."""

@@ -89,6 +89,7 @@ function link(index) {
 async function seek(index) {
   tape.wanted = Math.min(tape.timeline.length - 1, Math.max(0, index));
   $("seek").value = String(tape.wanted);
+  clearTimeout(tape.linking);
   if (tape.busy) return;
   tape.busy = true;
   try {
@@ -151,9 +152,9 @@ function spark() {
   pen.globalAlpha = 1;
 }
 
-/// Moment that the address names (`#at=N`).
-function asked() {
-  const at = /at=(\d+)/.exec(location.hash || location.search);
+/// Moment that an address names (`#at=N`).
+function asked(address) {
+  const at = /[#?&]at=(\d+)/.exec(address);
   return at ? Number(at[1]) : 0;
 }
 
@@ -180,9 +181,12 @@ async function begin() {
     if (event.key === "ArrowRight") { event.preventDefault(); play(false); seek(tape.wanted + 1); }
     if (event.key === "ArrowLeft") { event.preventDefault(); play(false); seek(tape.wanted - 1); }
   });
-  addEventListener("hashchange", () => seek(asked()));
+  addEventListener("hashchange", (event) => seek(asked(event.newURL)));
   state("recorded", "recorded");
-  await seek(asked());
+  await seek(asked(location.href));
 }
+
+addEventListener("resize", () => { draw(); spark(); });
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { draw(); spark(); });
 
 begin().catch((error) => { fail(String(error)); state("ended", "no answer from v2vloc view"); });

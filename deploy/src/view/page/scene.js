@@ -253,5 +253,3 @@ $("follow").addEventListener("click", () => {
   if (view.follow) view.shift = [0, 0];
   draw();
 });
-addEventListener("resize", () => { draw(); spark(); });
-matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { draw(); spark(); });
