@@ -5,6 +5,8 @@
 //! contents) and one wire version: all are in its name. It holds one packed message per sweep, as on the wire, each
 //! after its length: truncated or changed messages are detected.
 
+mod sweep_encoder;
+
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Write};
 use std::os::unix::fs::FileExt;
@@ -19,7 +21,7 @@ use protocol::message::Bev;
 use protocol::{Dtype, Header, Limits, WIRE_VERSION, WireError, wire};
 use tch::{Device, TchError, Tensor};
 
-use crate::sweep_encoder::SweepEncoder;
+use sweep_encoder::SweepEncoder;
 
 /// Digits of each hash in the name of a file.
 const HASH_DIGITS: usize = 12;

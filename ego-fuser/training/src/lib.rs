@@ -9,5 +9,4 @@
 pub mod feature_store;
 pub mod loss;
 pub mod samples;
-mod sweep_encoder;
 pub mod train;

@@ -5,7 +5,7 @@ use std::io;
 use std::path::Path;
 use std::process;
 
-use clap::{Arg, ArgAction, Command, CommandFactory, FromArgMatches, Parser};
+use clap::{Arg, ArgAction, Command, Parser};
 use clap_complete::Shell;
 
 use crate::output::{self, Verbosity};
@@ -63,6 +63,8 @@ fn generate(mut command: Command, wanted: &str) -> io::Result<()> {
 
 #[cfg(test)]
 mod tests {
+    use clap::{CommandFactory, FromArgMatches};
+
     use super::*;
 
     #[derive(Debug, Parser)]

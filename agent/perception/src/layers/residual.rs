@@ -42,7 +42,6 @@ impl ResidualBlock {
     }
 
     /// `[N, C_in, H, W]` to `[N, C, H', W']`.
-    #[must_use]
     pub fn forward(&self, x: &Tensor, train: bool) -> Tensor {
         let beside = match &self.shortcut {
             Some(shortcut) => shortcut.forward(x, train),

@@ -89,6 +89,8 @@ impl NoiseSchedule {
 
 #[cfg(test)]
 mod tests {
+    use tch::Kind;
+
     use super::*;
 
     #[test]

@@ -12,23 +12,23 @@ use protocol::message::Bev;
 use protocol::{BevFeatures, CavId, CodecConfig, Dtype, NoPoseReason, PoseEstimate, Stamp, WireError, wire};
 use tch::Device;
 
-use crate::feature_store::FeatureStoreError;
+use super::FeatureStoreError;
 
 /// zstd level of a message: more costs time and saves nothing.
 const ZSTD_LEVEL: i32 = 1;
 
 /// Encoder of the sweeps of some scenarios.
-pub(crate) struct SweepEncoder {
-    pub(crate) weights: Arc<Weights>,
-    pub(crate) scenarios: Arc<[Scenario]>,
+pub(super) struct SweepEncoder {
+    pub(super) weights: Arc<Weights>,
+    pub(super) scenarios: Arc<[Scenario]>,
     /// Index of each scenario's first sweep, and of the end.
-    pub(crate) first: Arc<[usize]>,
+    pub(super) first: Arc<[usize]>,
     /// Numeric type of the values.
-    pub(crate) dtype: Dtype,
+    pub(super) dtype: Dtype,
     /// The store, for messages of errors.
-    pub(crate) path: PathBuf,
+    pub(super) path: PathBuf,
     /// Network of this thread, once there is one.
-    pub(crate) detector: Option<Detector>,
+    pub(super) detector: Option<Detector>,
 }
 
 impl Clone for SweepEncoder {
@@ -51,7 +51,7 @@ impl SweepEncoder {
     ///
     /// # Errors
     /// Those of the network and of the wire format.
-    pub(crate) fn message(&mut self, sweep: usize) -> Result<Vec<u8>, FeatureStoreError> {
+    pub(super) fn message(&mut self, sweep: usize) -> Result<Vec<u8>, FeatureStoreError> {
         let scenario = self.first.partition_point(|&first| first <= sweep) - 1;
         let Some(of) = self.scenarios.get(scenario) else { return Ok(Vec::new()) };
         let within = sweep - self.first[scenario];
