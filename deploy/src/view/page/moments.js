@@ -60,7 +60,7 @@ async function check() {
   if (!isKnown(silent)) hint("Nothing is published in this run yet.");
 }
 
-const tape = { timeline: [], at: -1, wanted: 0, busy: false, playing: null, linking: null };
+const tape = { timeline: [], at: -1, wanted: 0, busy: false, playing: null };
 
 async function moment(index) {
   const answer = await fetch(`frame/${index}`);
@@ -79,17 +79,15 @@ async function resultUntil(index) {
   else if (known !== tape.timeline[at].capture_s) view.answered = (await moment(at)).frame;
 }
 
-/// A link to the moment in the address; late, as browsers limit how often that may change.
-function link(index) {
-  clearTimeout(tape.linking);
-  tape.linking = setTimeout(() => history.replaceState(null, "", `#at=${index}`), 200);
+/// A link to the moment in the address; not during play, as browsers limit how often that may change.
+function link() {
+  if (!tape.playing && tape.at >= 0) history.replaceState(null, "", `#at=${tape.at}`);
 }
 
 /// Recorded: one frame at a time; during a fetch only the last request counts.
 async function seek(index) {
   tape.wanted = Math.min(tape.timeline.length - 1, Math.max(0, index));
   $("seek").value = String(tape.wanted);
-  clearTimeout(tape.linking);
   if (tape.busy) return;
   tape.busy = true;
   try {
@@ -100,7 +98,7 @@ async function seek(index) {
       tape.at = next;
       $("moment").textContent = `${next + 1} of ${tape.timeline.length}`;
       show(found);
-      link(next);
+      link();
       spark();
     }
   } finally {
@@ -117,6 +115,7 @@ function play(on) {
     if (tape.wanted >= last) play(false); else seek(tape.wanted + 1);
   }, 100 / Number($("speed").value)) : null;
   $("play").textContent = on ? "pause" : "play";
+  link();
 }
 
 /// The frame with the most false positives and missed objects.
