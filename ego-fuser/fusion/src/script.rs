@@ -207,8 +207,16 @@ mod tests {
         let file = folder.path().join("weighted.pt");
         write(&file);
         let script = ScriptFusion::load(&file, Device::Cpu).unwrap();
-        let four = maps(&Tensor::rand([2, 3, 4, 5], FLOAT), &Tensor::ones([2, 3, 4, 5, 1], FLOAT));
-        let message = script.fuse(&four).unwrap_err().to_string();
-        assert!(message.contains("weighted.pt") && message.contains("not of [3, 4, 5]"), "{message}");
+        let refused = |mask: &[i64]| {
+            let maps = maps(&Tensor::rand([2, 3, 4, 5], FLOAT), &Tensor::ones(mask, FLOAT));
+            script.fuse(&maps).unwrap_err().to_string()
+        };
+        // The module fails, or returns a map of another shape.
+        for (mask, reason) in [(&[2, 2, 4, 5][..], "must match"), (&[7, 2, 1, 4, 5], "[2, 3, 4, 5], not of [3, 4, 5]")]
+        {
+            let message = refused(mask);
+            assert!(message.contains("weighted.pt") && message.contains(reason), "{message}");
+            assert!(!message.contains("Traceback"), "{message}");
+        }
     }
 }
