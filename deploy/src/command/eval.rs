@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use agent::attack::{AttackConfig, Falsification};
 use agent::config::Threads;
 use agent::rate::RateConfig;
+use clap::ArgGroup;
 use dataset::IntensityScale;
 use dataset::evaluation_protocol::ProtocolConfig;
 use deploy::experiment::evaluation::{EvaluationOptions, Part, evaluate, frame_count};
@@ -30,6 +31,7 @@ use support::cli::BadInput;
 use support::cli::Outcome;
 
 #[derive(Debug, clap::Args)]
+#[command(group = ArgGroup::new("emulation").args(["link", "bandwidth", "latency"]).multiple(true))]
 pub(crate) struct Arguments {
     /// Data set, split or scenario; its layout is detected. The first vehicle of each scenario is the ego.
     #[arg(long, value_name = "DIR", required_unless_present = "table")]
@@ -61,13 +63,13 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "MS", default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=10_000))]
     delay: u64,
     /// Link emulation between neighbours and ego, in simulation time: a preset of `sim-replay link`, or a file.
-    #[arg(long, value_name = "PRESET|FILE", conflicts_with = "delay", group = "emulation")]
+    #[arg(long, value_name = "PRESET|FILE", conflicts_with = "delay")]
     link: Option<String>,
     /// Rate of the link, Mbit/s; replaces that of --link.
-    #[arg(long, value_name = "MBPS", conflicts_with = "delay", group = "emulation")]
+    #[arg(long, value_name = "MBPS", conflicts_with = "delay")]
     bandwidth: Option<f64>,
     /// Delay of the link after the last bit, milliseconds; replaces that of --link.
-    #[arg(long, value_name = "MS", conflicts_with = "delay", group = "emulation")]
+    #[arg(long, value_name = "MS", conflicts_with = "delay")]
     latency: Option<f64>,
     /// Same seed, same losses and delays (--link).
     #[arg(long, default_value_t = 0, requires = "emulation")]
