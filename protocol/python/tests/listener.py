@@ -13,7 +13,9 @@ from data_set import refuses
 from fleet import AREA_M, FRAMES, background, call, free_endpoint
 
 WAITS = """
-import sys, v2vloc
+import signal, sys, v2vloc
+# A process that a shell has started in the background ignores Ctrl-C.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 listener = v2vloc.listen(sys.argv[1], run="empty", timeout_s=None)
 print("listening", flush=True)
 next(listener)
