@@ -81,7 +81,9 @@ impl RemoteStatus {
         while let Pop::Item(topic, message) = tap.take(Some(end)) {
             seen.add(&topic, &message.pieces());
         }
+        // This observer reports, too.
         let own = &bus.identity().process;
+        seen.reports.remove(own.as_str());
         let alive =
             present(bus.session(), run)?.iter().filter(|process| *process != own).map(ToString::to_string).collect();
         Ok(seen.status(run.to_string(), time, &alive))
