@@ -37,7 +37,7 @@ pub struct RemoteProcess {
     pub resident_mib: Option<f64>,
     /// Number of messages that it has sent.
     pub sent: Option<u64>,
-    /// Number of messages of which it knows that they were dropped.
+    /// Number of messages in its ledger that were dropped.
     pub dropped: Option<u64>,
 }
 
@@ -150,7 +150,7 @@ struct Seen {
 }
 
 impl Seen {
-    /// Adds a message; one that cannot be decoded says nothing about its sender.
+    /// Adds a message; one that cannot be decoded is ignored: its sender then counts as silent.
     fn add(&mut self, topic: &Topic, pieces: &[&[u8]]) {
         match topic {
             Topic::Stats(process) => {

@@ -112,6 +112,9 @@ impl Fusion for ScriptFusion {
         if found != expected {
             return Err(of_file(format!("forward returns a map of {found:?}, not of {expected:?}")));
         }
+        if fused.kind() != features.kind() {
+            return Err(of_file(format!("forward returns {:?}, not {:?}", fused.kind(), features.kind())));
+        }
         Ok(fused.into())
     }
 }

@@ -53,7 +53,7 @@ struct Connection {
     subscriber: PassiveSubscriber,
 }
 
-/// What the next step of a listener gave.
+/// Result of one step of a listener.
 enum Step {
     Message(RawMessage),
     /// Nothing within the poll interval.

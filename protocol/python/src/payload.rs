@@ -158,7 +158,7 @@ impl Detections {
         Py::new(py, made)
     }
 
-    /// What one agent finds in its own sensor data.
+    /// Detections of one agent in its own sensor data.
     pub(crate) fn of_agent(py: Python<'_>, cav: &str, boxes: &protocol::Boxes) -> PyResult<Py<Self>> {
         Py::new(py, Self::of_list(py, cav, &boxes.pose, &boxes.detections)?)
     }

@@ -17,7 +17,7 @@ pub(crate) enum Access {
 }
 
 impl Access {
-    /// What a certificate permits in a run.
+    /// Streams that a certificate permits in a run.
     pub(crate) fn of(principal: &Principal, run: &RunId) -> Self {
         let rights = principal.rights(&RunScope::One(run.clone())).into_iter();
         let subscribed = rights.filter(|right| right.act == Operation::Subscribe).map(|right| right.keys);

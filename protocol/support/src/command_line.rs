@@ -32,7 +32,7 @@ pub fn parse<P: Parser>() -> P {
     P::from_arg_matches(&matches).unwrap_or_else(|error| error.exit())
 }
 
-/// The options that set how much is said on standard error.
+/// The options of the verbosity on standard error.
 fn with_verbosity(command: Command) -> Command {
     let verbose = Arg::new("verbose").short('v').long("verbose").action(ArgAction::Count).global(true);
     let quiet = Arg::new("quiet").short('q').long("quiet").action(ArgAction::SetTrue).global(true);

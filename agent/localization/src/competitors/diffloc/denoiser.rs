@@ -36,7 +36,7 @@ pub struct PoseDenoiser {
     step_frequencies: Tensor,
 }
 
-/// What the sweeps of a window know of each other.
+/// Attention between the sweeps of a window.
 #[derive(Debug, Clone, Copy)]
 pub enum Windows<'a> {
     /// Each sweep is alone.

@@ -55,7 +55,7 @@ impl NoiseSchedule {
         poses.f_mul(&factor(signal)?)?.f_add(&noise.f_mul(&factor(deviation)?)?)
     }
 
-    /// Finds poses from noise in `count` steps without randomness; `predict` tells the noise in poses at a step.
+    /// Finds poses from noise in `count` steps without randomness; `predict` returns the noise in poses at a step.
     ///
     /// # Errors
     /// Those of the tensor library and of `predict`.

@@ -13,7 +13,7 @@ pub const RANGE_M: f64 = 80.0;
 /// Smallest number of voxels of a sweep that can be localized.
 const MIN_VOXELS: usize = 64;
 
-/// What the network sees of one sweep.
+/// Input of the network from one sweep.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SweepInput {
     /// [`POINTS`] points in the order of farthest-point sampling, metres in the sensor frame.
