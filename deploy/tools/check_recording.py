@@ -7,6 +7,7 @@
 Exit code 0: everything decodes. 1: something does not. 2: the packages are not installed.
 """
 
+import hashlib
 import json
 import struct
 import sys
@@ -73,10 +74,21 @@ def markers(message):
              "wxyz": quaternion(m.pose.orientation), "size": xyz(m.scale), "text": m.text} for m in shown]
 
 
+def camera_info(message):
+    return {"stamp_s": seconds(message.header.stamp), "frame": message.header.frame_id, "width": message.width,
+            "height": message.height, "intrinsics": list(message.k), "distortion": message.distortion_model}
+
+
+def image(message):
+    return {"stamp_s": seconds(message.header.stamp), "frame": message.header.frame_id, "format": message.format,
+            "sha256": hashlib.sha256(bytes(message.data)).hexdigest()}
+
+
 READERS = {"sensor_msgs/msg/PointCloud2": cloud, "geometry_msgs/msg/PoseWithCovarianceStamped": pose,
            "nav_msgs/msg/Odometry": odometry, "vision_msgs/msg/Detection3DArray": detections,
            "diagnostic_msgs/msg/DiagnosticArray": diagnostics, "tf2_msgs/msg/TFMessage": transforms,
-           "visualization_msgs/msg/MarkerArray": markers}
+           "visualization_msgs/msg/MarkerArray": markers, "sensor_msgs/msg/CameraInfo": camera_info,
+           "sensor_msgs/msg/CompressedImage": image}
 
 
 def main(path):
