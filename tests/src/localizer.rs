@@ -3,7 +3,8 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use localization::competitors::{EndToEnd, EndToEndConfig, EndToEndKind, EndToEndLocalizer};
+use localization::baselines::hypliloc::{HypLiLoc, HypLiLocConfig, HypLiLocLocalizer};
+use localization::baselines::sgloc::{SgLoc, SgLocConfig, SgLocLocalizer};
 use localization::pgc::{SceneEncoder, SceneEncoderConfig, SceneHead, SceneHeadConfig};
 use perception::weights::{CONFIG_KEY, KIND_KEY, Precision, save};
 use serde::Serialize;
@@ -56,19 +57,40 @@ pub fn write(folder: &Path, seed: i64) -> (PathBuf, PathBuf) {
     (encoder, head)
 }
 
-/// Writes a network as if it had been trained end to end, with random parameters, the same for the same seed.
+/// Writes an SGLoc network as if it had been trained, with random parameters, the same for the same seed.
 ///
 /// # Panics
 /// When a file cannot be written.
-pub fn write_end_to_end(folder: &Path, regresses: EndToEndKind, seed: i64) -> PathBuf {
+pub fn write_sgloc(folder: &Path, seed: i64) -> PathBuf {
+    let config = SgLocConfig { scene_name: "nowhere".into(), origin_m: [0.0; 3], encoder: tiny() };
+    write_baseline(&folder.join("sgloc.safetensors"), seed, &metadata(SgLocLocalizer::KIND, &config), |root| {
+        SgLoc::new(root, &config).expect("a configuration that fits");
+    })
+}
+
+/// Writes a HypLiLoc network as if it had been trained, with random parameters, the same for the same seed.
+///
+/// # Panics
+/// When a file cannot be written.
+pub fn write_hypliloc(folder: &Path, seed: i64) -> PathBuf {
+    let config = HypLiLocConfig { scene_name: "nowhere".into(), origin_m: [0.0; 3], scale_m: [100.0; 3] };
+    write_baseline(&folder.join("hypliloc.safetensors"), seed, &metadata(HypLiLocLocalizer::KIND, &config), |root| {
+        HypLiLoc::new(root);
+    })
+}
+
+fn write_baseline(
+    path: &Path,
+    seed: i64,
+    about: &BTreeMap<String, String>,
+    build: impl FnOnce(&tch::nn::Path<'_>),
+) -> PathBuf {
     let _generator = random_generator_lock();
     tch::manual_seed(seed);
-    let config = EndToEndConfig { regresses, scene_name: "nowhere".into(), origin_m: [0.0; 3], encoder: tiny() };
     let network = VarStore::new(Device::Cpu);
-    EndToEnd::new(&network.root(), &config).expect("a configuration that fits");
-    let path = folder.join(format!("{regresses:?}.safetensors"));
-    save(&path, &network, &metadata(EndToEndLocalizer::KIND, &config), Precision::Single).expect("a writable folder");
-    path
+    build(&network.root());
+    save(path, &network, about, Precision::Single).expect("a writable folder");
+    path.to_owned()
 }
 
 fn tiny() -> SceneEncoderConfig {

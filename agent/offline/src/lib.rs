@@ -1,6 +1,6 @@
 //! Offline work on localization: training and evaluation on recorded or generated scenes.
 //!
-//! - [`training`]: encoder, scene-specific heads and end-to-end networks.
+//! - [`training`]: encoder, scene-specific heads and baselines.
 //! - [`icp_map`], [`sweep_database`]: what localizers without training start from.
 //! - [`mapping`]: a head for a place, from drives through it to its measured accuracy.
 //! - [`evaluation`]: errors, confidence and times of a localizer over a data set.

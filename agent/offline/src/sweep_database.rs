@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use dataset::{LeftOut, LoadOptions, Problem, ReadError, Scenario};
-use localization::competitors::{DescribedSweep, SweepDatabase};
+use localization::baselines::{DescribedSweep, SweepDatabase};
 use localization::pgc::{Localizer, LocalizerError, LocalizerTimes};
 
 /// Error of building a database of sweeps.

@@ -13,7 +13,7 @@ use dataset::{self, OpenOptions};
 use fusion::Exchange;
 use fusion::Method;
 use link::LinkEmulator;
-use localization::competitors::load_competitor;
+use localization::baselines::load_baseline;
 use localization::pgc::pose_solver::PoseSolver;
 use localization::pgc::{Localizer, LocalizerError};
 use localization::pose_source::{PgcConfig, PoseSourceConfig, TrackedPoseConfig};
@@ -213,8 +213,8 @@ fn load_networks(pose: &PoseSourceConfig) -> Result<(), LocalizerError> {
         | PoseSourceConfig::Tracked(TrackedPoseConfig { encoder, head, .. }) => {
             Localizer::load(encoder, head, Inference::default()).map(drop)
         }
-        PoseSourceConfig::EndToEnd(network) => {
-            load_competitor(&network.weights, Device::Cpu, PoseSolver::default()).map(drop)
+        PoseSourceConfig::Baseline(network) => {
+            load_baseline(&network.weights, Device::Cpu, PoseSolver::default()).map(drop)
         }
         PoseSourceConfig::Recorded | PoseSourceConfig::Noisy(_) | PoseSourceConfig::Cached(_) => Ok(()),
     }

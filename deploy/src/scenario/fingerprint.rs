@@ -23,9 +23,9 @@ pub struct Provenance {
     /// SHA-256 of the localizer's encoder and of its head, if a vehicle localizes itself.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub localizer_sha256: Option<[String; 2]>,
-    /// SHA-256 of the network that was trained end to end, if a vehicle localizes itself with it.
+    /// SHA-256 of the baseline's weights, if a vehicle localizes itself with it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub end_to_end_sha256: Option<String>,
+    pub baseline_sha256: Option<String>,
     /// SHA-256 over names and contents of the scenario's point clouds and annotations; images do not count.
     pub scene_sha256: String,
     /// Number of files that `scene_sha256` covers.
@@ -39,14 +39,14 @@ impl Provenance {
     /// The first file that cannot be read, by name.
     pub fn collect(programs: &[PathBuf], weights: &Path, poses: &[PoseSourceConfig], scene: &Path) -> io::Result<Self> {
         let scene_files = scene_files(scene)?;
-        let (mut localizer_sha256, mut end_to_end_sha256) = (None, None);
+        let (mut localizer_sha256, mut baseline_sha256) = (None, None);
         for pose in poses {
             match pose {
                 PoseSourceConfig::Pgc(PgcConfig { encoder, head, .. })
                 | PoseSourceConfig::Tracked(TrackedPoseConfig { encoder, head, .. }) => {
                     localizer_sha256 = Some([hash_file(encoder)?.1, hash_file(head)?.1]);
                 }
-                PoseSourceConfig::EndToEnd(network) => end_to_end_sha256 = Some(hash_file(&network.weights)?.1),
+                PoseSourceConfig::Baseline(network) => baseline_sha256 = Some(hash_file(&network.weights)?.1),
                 PoseSourceConfig::Recorded | PoseSourceConfig::Noisy(_) | PoseSourceConfig::Cached(_) => {}
             }
         }
@@ -55,7 +55,7 @@ impl Provenance {
             program_sha256: hash_all(programs.first().and_then(|path| path.parent()).unwrap_or(scene), programs)?,
             weights_sha256: hash_file(weights)?.1,
             localizer_sha256,
-            end_to_end_sha256,
+            baseline_sha256,
             scene_sha256: hash_all(scene, &scene_files)?,
             scene_files: scene_files.len(),
         })
@@ -117,7 +117,7 @@ fn named(error: io::Error, path: &Path) -> io::Error {
 
 #[cfg(test)]
 mod tests {
-    use localization::pose_source::{EndToEndPoseConfig, PgcConfig};
+    use localization::pose_source::{BaselinePoseConfig, PgcConfig};
 
     use super::*;
 
@@ -138,7 +138,7 @@ mod tests {
         let file = || weights.clone();
         let poses = [
             PoseSourceConfig::Pgc(PgcConfig { encoder: file(), head: file(), ..Default::default() }),
-            PoseSourceConfig::EndToEnd(EndToEndPoseConfig { weights: file(), ..Default::default() }),
+            PoseSourceConfig::Baseline(BaselinePoseConfig { weights: file(), ..Default::default() }),
         ];
         let collect =
             |scene: &Path| Provenance::collect(std::slice::from_ref(&weights), &weights, &poses, scene).unwrap();
@@ -147,7 +147,7 @@ mod tests {
         // From `printf weights | sha256sum`.
         assert!(first.weights_sha256.starts_with("9a129038d9a00aed"), "{}", first.weights_sha256);
         assert_eq!(first.localizer_sha256.as_ref().unwrap()[1], first.weights_sha256);
-        assert_eq!(first.end_to_end_sha256.as_ref(), Some(&first.weights_sha256));
+        assert_eq!(first.baseline_sha256.as_ref(), Some(&first.weights_sha256));
         assert_eq!(first, collect(&scene(two.path(), "0 0 0")));
         assert_ne!(first.scene_sha256, collect(&scene(three.path(), "0 0 1")).scene_sha256);
     }

@@ -184,8 +184,8 @@ mod tests {
         assert!(pgc.encoder.is_absolute() && pgc.head.exists());
         assert_eq!(scenario.settings_of(&CavId::new("4279").unwrap()).pose, PoseSourceConfig::Recorded);
         assert_eq!(parse(&scenario.to_yaml()).unwrap(), scenario);
-        std::fs::write(&file, text("end_to_end: {weights: e.safetensors}")).unwrap();
-        assert_eq!(Scenario::load(&file).unwrap().poses()[1].name(), "end_to_end");
+        std::fs::write(&file, text("baseline: {weights: e.safetensors}")).unwrap();
+        assert_eq!(Scenario::load(&file).unwrap().poses()[1].name(), "baseline");
     }
 
     #[test]

@@ -6,7 +6,6 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use deploy::scenario::Scenario;
-use localization::competitors::EndToEndKind;
 use serde_json::Value;
 use tests::fleet::{Up, programs, results, write_scenario};
 use tests::locks::exclusive_lock;
@@ -64,11 +63,11 @@ fn a_vehicle_without_a_pose_reports_it_and_the_fleet_goes_on() {
 }
 
 #[test]
-fn a_vehicle_whose_network_was_trained_end_to_end_takes_part_with_the_pose_that_it_regresses() {
+fn a_vehicle_with_a_baseline_takes_part_with_the_pose_that_it_regresses() {
     let _exclusive = exclusive_lock();
     let folder = tempfile::tempdir().unwrap();
-    localizer::write_end_to_end(folder.path(), EndToEndKind::Pose, 3);
-    let own = "vehicles: {4288: {pose: {end_to_end: {weights: Pose.safetensors}}}}";
+    localizer::write_hypliloc(folder.path(), 3);
+    let own = "vehicles: {4288: {pose: {baseline: {weights: hypliloc.safetensors}}}}";
     let scenario = write_scenario(folder.path(), 4, "lockstep: true", own);
     let mut up = Up::start(folder.path(), &scenario);
     assert_eq!(up.wait().code(), Some(0));
@@ -81,7 +80,7 @@ fn a_vehicle_whose_network_was_trained_end_to_end_takes_part_with_the_pose_that_
     assert_eq!(json("ledger.json")["balances"], true);
     assert_eq!(results(&up.folder).len(), 4);
     let provenance = Scenario::load(&up.folder.join("scenario.yaml")).unwrap().provenance.unwrap();
-    assert_eq!(provenance.end_to_end_sha256.unwrap().len(), 64);
+    assert_eq!(provenance.baseline_sha256.unwrap().len(), 64);
 }
 
 #[test]
@@ -138,7 +137,7 @@ fn a_tracked_vehicle_has_an_accurate_pose_in_every_sweep_of_a_drive() {
 }
 
 #[test]
-fn competitors_are_evaluated_on_the_same_sweeps_with_the_same_numbers() {
+fn baselines_are_evaluated_on_the_same_sweeps_with_the_same_numbers() {
     let folder = tempfile::tempdir().unwrap();
     let (encoder, _) = scene_and_networks(folder.path());
     let scene = folder.path().join("scene");
@@ -151,20 +150,20 @@ fn competitors_are_evaluated_on_the_same_sweeps_with_the_same_numbers() {
     };
     // These sweeps are mostly ground, of which few cells are used; a regressed pose is always reported, with full
     // confidence.
-    let cells = localizer::write_end_to_end(folder.path(), EndToEndKind::SgLoc, 3);
-    let summary = json("--end-to-end", &cells);
+    let cells = localizer::write_sgloc(folder.path(), 3);
+    let summary = json("--baseline", &cells);
     assert_eq!((&summary["sweeps"], &summary["outcomes"]["too_few_points"]), (&8.into(), &8.into()), "{summary}");
     assert!(summary["ms"]["solve"].as_f64().unwrap() > 0.0, "{summary}");
-    let pose = localizer::write_end_to_end(folder.path(), EndToEndKind::Pose, 3);
-    let summary = json("--end-to-end", &pose);
+    let pose = localizer::write_hypliloc(folder.path(), 3);
+    let summary = json("--baseline", &pose);
     assert_eq!((&summary["outcomes"]["pose"], &summary["ms"]["solve"]), (&8.into(), &0.0.into()), "{summary}");
     assert!(summary["mean_m"].as_f64().unwrap() > 0.0 && summary["calibration"][0]["sigma"] == 1.0, "{summary}");
     // Registration against a map starts from a pose estimate, and these vehicles have none.
     assert_eq!(json("--icp-map", &scene)["outcomes"]["no_source"], 8);
 
-    let (code, _, stderr) = eval("--end-to-end", &encoder, &[]);
+    let (code, _, stderr) = eval("--baseline", &encoder, &[]);
     assert!(code == Some(2) && stderr.contains("encoder.safetensors: weights of kind"), "{stderr}");
-    let (code, _, stderr) = eval("--end-to-end", &pose, &["--fit-confidence"]);
+    let (code, _, stderr) = eval("--baseline", &pose, &["--fit-confidence"]);
     assert!(code == Some(2) && stderr.contains("cannot be used with"), "{stderr}");
     let (code, _, stderr) = eval("--icp-map", &folder.path().join("nowhere"), &[]);
     assert!(code == Some(2) && stderr.contains("nowhere"), "{stderr}");
@@ -223,9 +222,9 @@ fn an_agent_without_its_networks_does_not_start() {
     assert!(code == Some(2) && output.contains("--encoder"), "{output}");
     let (code, output) = run(&["--pose-source", "pgc", "--encoder", "/nowhere/e", "--head", "/nowhere/h"]);
     assert!(code == Some(2) && output.contains("/nowhere/e"), "{output}");
-    let (code, output) = run(&["--pose-source", "end_to_end"]);
-    assert!(code == Some(2) && output.contains("--end-to-end"), "{output}");
-    let (code, output) = run(&["--pose-source", "end_to_end", "--end-to-end", "/nowhere/w"]);
+    let (code, output) = run(&["--pose-source", "baseline"]);
+    assert!(code == Some(2) && output.contains("--baseline"), "{output}");
+    let (code, output) = run(&["--pose-source", "baseline", "--baseline", "/nowhere/w"]);
     assert!(code == Some(2) && output.contains("/nowhere/w"), "{output}");
 }
 

@@ -4,13 +4,14 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use agent_offline::training::{
-    DiffLocReport, DiffLocTrainConfig, EncoderReport, EncoderStart, EncoderTrainConfig, EndToEndReport,
-    EndToEndTrainConfig, LocalizerTrainError, RedundancyConfig, SceneReport, SceneTrainConfig, SweepAugmentation,
-    train_diffloc, train_encoder, train_end_to_end, train_scene,
+    DiffLocReport, DiffLocTrainConfig, EncoderReport, EncoderTrainConfig, LocalizerTrainError, RedundancyConfig,
+    SceneReport, SceneTrainConfig, SgLocReport, SgLocTrainConfig, SweepAugmentation, train_diffloc, train_encoder,
+    train_scene, train_sgloc,
 };
 use dataset::{self, LoadOptions};
-use localization::competitors::diffloc::{DiffLocConfig, RangeImageConfig};
-use localization::competitors::{EndToEndKind, EndToEndLocalizer, load_competitor};
+use localization::baselines::diffloc::{DiffLocConfig, RangeImageConfig};
+use localization::baselines::load_baseline;
+use localization::baselines::sgloc::SgLocConfig;
 use localization::pgc::pose_solver::PoseSolver;
 use localization::pgc::{Localizer, LocalizerError, SceneEncoder};
 use perception::inference::Inference;
@@ -140,45 +141,42 @@ fn a_localizer_learns_two_drives_and_finds_itself_on_them() {
 }
 
 #[test]
-fn competitors_learn_on_the_features_of_an_encoder_that_stays_as_it_is() {
+fn sgloc_learns_on_the_features_of_an_encoder_that_stays_as_it_is() {
     let _generator = random_generator_lock();
     let dir = tempfile::tempdir().unwrap();
     let scenes = drives(dir.path());
     let encoder = train_encoder(&encoder_config(&scenes, &dir.path().join("encoder"), 1), &mut |_| ()).unwrap();
     let encoder = encoder.trained.weights;
-    for (regresses, batch, steps) in [(EndToEndKind::SgLoc, 2, 150), (EndToEndKind::Pose, 32, 300)] {
-        let config = |steps| EndToEndTrainConfig {
-            scenes: vec![scenes.clone()],
-            regresses,
-            scene_name: "small".into(),
-            encoder: EncoderStart::Frozen(encoder.clone()),
-            run: RunConfig { batch, learning_rate: 3e-3, ..run(&dir.path().join(format!("{regresses:?}")), steps) },
-        };
-        let (mut errors, mut encoded) = (Vec::new(), 0);
-        let trained = train_end_to_end(&config(steps), &mut |report| match report {
-            EndToEndReport::Encoding(done, _) => encoded = *done,
-            EndToEndReport::Stepped { error_m, .. } => errors.push(*error_m),
-        })
-        .unwrap();
-        assert!(encoded == 48 && errors.last().unwrap() < &(0.7 * errors[0]), "{regresses:?}: {errors:?}");
+    let config = |steps| SgLocTrainConfig {
+        scenes: vec![scenes.clone()],
+        scene_name: "small".into(),
+        encoder: encoder.clone(),
+        run: RunConfig { batch: 2, learning_rate: 3e-3, ..run(&dir.path().join("sgloc"), steps) },
+    };
+    let (mut errors, mut encoded) = (Vec::new(), 0);
+    let trained = train_sgloc(&config(150), &mut |report| match report {
+        SgLocReport::Encoding(done, _) => encoded = *done,
+        SgLocReport::Stepped { error_m, .. } => errors.push(*error_m),
+    })
+    .unwrap();
+    assert!(encoded == 48 && errors.last().unwrap() < &(0.7 * errors[0]), "{errors:?}");
 
-        // The file holds the trained layers, after the unchanged encoder.
-        let localizer = EndToEndLocalizer::load(&trained.weights, Device::Cpu).unwrap();
-        assert_eq!(localizer.config().encoder, small_encoder());
-        let (before, after) = (VarStore::new(Device::Cpu), VarStore::new(Device::Cpu));
-        SceneEncoder::new(&before.root(), &small_encoder()).unwrap();
-        SceneEncoder::new(&(after.root() / "encoder"), &small_encoder()).unwrap();
-        Weights::load(&encoder).unwrap().copy_into(&before).unwrap();
-        Weights::load(&trained.weights).unwrap().copy_into(&after).unwrap();
-        let kept = after.variables();
-        for (name, tensor) in before.variables() {
-            assert!(tensor.equal(&kept[&format!("encoder.{name}")]), "{name}");
-        }
-
-        let mut resumed = config(steps + 10);
-        resumed.run.resume = true;
-        assert_eq!(train_end_to_end(&resumed, &mut |_| ()).unwrap().steps, steps + 10);
+    // The file holds the trained head, after the unchanged encoder.
+    let written: SgLocConfig = Weights::load(&trained.weights).unwrap().config().unwrap();
+    assert_eq!(written.encoder, small_encoder());
+    let (before, after) = (VarStore::new(Device::Cpu), VarStore::new(Device::Cpu));
+    SceneEncoder::new(&before.root(), &small_encoder()).unwrap();
+    SceneEncoder::new(&(after.root() / "encoder"), &small_encoder()).unwrap();
+    Weights::load(&encoder).unwrap().copy_into(&before).unwrap();
+    Weights::load(&trained.weights).unwrap().copy_into(&after).unwrap();
+    let kept = after.variables();
+    for (name, tensor) in before.variables() {
+        assert!(tensor.equal(&kept[&format!("encoder.{name}")]), "{name}");
     }
+
+    let mut resumed = config(160);
+    resumed.run.resume = true;
+    assert_eq!(train_sgloc(&resumed, &mut |_| ()).unwrap().steps, 160);
 }
 
 #[test]
@@ -218,7 +216,7 @@ fn diffloc_learns_to_predict_noise_and_answers_alike_for_the_same_sweep() {
     // Far too short to find places: the error is only measured.
     assert!(summary.validation.unwrap().p50_m.is_finite());
 
-    let mut localizer = load_competitor(&summary.trained.weights, Device::Cpu, PoseSolver::default()).unwrap();
+    let mut localizer = load_baseline(&summary.trained.weights, Device::Cpu, PoseSolver::default()).unwrap();
     let dataset = dataset::open(&scenes).unwrap();
     let frame = dataset.scenarios[0].load(0, 3, &LoadOptions::default()).unwrap();
     let first = localizer.localize(&frame.points).unwrap().estimate;

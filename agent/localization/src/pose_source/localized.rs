@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 
 use super::motion_gate::{MotionGate, MotionGateConfig};
 use super::{PoseInput, PoseSource};
-use crate::competitors::{LightLoc, load_competitor};
+use crate::baselines::{LightLoc, load_baseline};
 use crate::pgc::pose_solver::PoseSolver;
 use crate::pgc::{Localize, Localizer, LocalizerError};
 
@@ -33,12 +33,12 @@ pub struct PgcConfig {
     pub motion_gate: MotionGateConfig,
 }
 
-/// A network that was trained end to end, a competitor of PGC.
+/// A baseline of the paper: SGLoc, DiffLoc or HypLiLoc.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema, clap::Args)]
 #[serde(deny_unknown_fields)]
-pub struct EndToEndPoseConfig {
-    /// Weights of a network that was trained end to end on the scene (pose source end_to_end).
-    #[arg(id = "end_to_end", long = "end-to-end", value_name = "FILE")]
+pub struct BaselinePoseConfig {
+    /// Weights of a baseline of `agent train` for the scene: SGLoc, DiffLoc or HypLiLoc (pose source baseline).
+    #[arg(id = "baseline", long = "baseline", value_name = "FILE")]
     pub weights: PathBuf,
     /// Motion limits of the vehicle.
     #[arg(skip)]
@@ -68,12 +68,12 @@ impl LocalizedPose {
         Ok(Self::new(localizer, config.motion_gate.clone()))
     }
 
-    /// Reads a network that was trained end to end, which is computed in floating point.
+    /// Reads a baseline, which is computed in floating point.
     ///
     /// # Errors
     /// [`LocalizerError`] names the file and what is wrong with it.
-    pub fn end_to_end(config: &EndToEndPoseConfig, inference: Inference) -> Result<Self, LocalizerError> {
-        let localizer = load_competitor(&config.weights, inference.device, PoseSolver::default())?;
+    pub fn baseline(config: &BaselinePoseConfig, inference: Inference) -> Result<Self, LocalizerError> {
+        let localizer = load_baseline(&config.weights, inference.device, PoseSolver::default())?;
         Ok(Self::new(localizer, config.motion_gate.clone()))
     }
 

@@ -22,7 +22,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 pub use error_table::{ErrorTable, ErrorTableError, TableRow};
-pub use localized::{EndToEndPoseConfig, LocalizedPose, PgcConfig};
+pub use localized::{BaselinePoseConfig, LocalizedPose, PgcConfig};
 pub use noise::PlanarError;
 pub use noisy::NoisyPose;
 pub(crate) use pose_table::CachedPose;
@@ -98,8 +98,8 @@ pub enum PoseSourceConfig {
     Pgc(PgcConfig),
     /// Estimated by PGC and followed from sweep to sweep.
     Tracked(TrackedPoseConfig),
-    /// Estimated from the sweep alone, by a network that was trained end to end.
-    EndToEnd(EndToEndPoseConfig),
+    /// Estimated from the sweep alone, by a baseline of the paper: SGLoc, DiffLoc or HypLiLoc.
+    Baseline(BaselinePoseConfig),
     /// Read from a table that `agent localize` wrote.
     Cached(CachedPoseConfig),
 }
@@ -208,7 +208,7 @@ impl PoseSourceConfig {
             Self::Noisy(_) => "noisy",
             Self::Pgc(_) => "pgc",
             Self::Tracked(_) => "tracked",
-            Self::EndToEnd(_) => "end_to_end",
+            Self::Baseline(_) => "baseline",
             Self::Cached(_) => "cached",
         }
     }
@@ -275,7 +275,7 @@ impl PoseSourceConfig {
                 named("head", "--head", &tracked.head)?;
                 tracked.validate()
             }
-            Self::EndToEnd(network) => named("weights", "--end-to-end", &network.weights),
+            Self::Baseline(network) => named("weights", "--baseline", &network.weights),
             Self::Cached(table) => named("file", "--poses", &table.file),
         }
     }
@@ -288,7 +288,7 @@ impl PoseSourceConfig {
             Self::Noisy(noisy) => noisy.table.iter_mut().collect(),
             Self::Pgc(pgc) => vec![&mut pgc.encoder, &mut pgc.head],
             Self::Tracked(tracked) => vec![&mut tracked.encoder, &mut tracked.head],
-            Self::EndToEnd(network) => vec![&mut network.weights],
+            Self::Baseline(network) => vec![&mut network.weights],
             Self::Cached(cached) => vec![&mut cached.file],
         };
         files.into_iter().for_each(|file| *file = change(file));
@@ -303,7 +303,7 @@ impl PoseSourceConfig {
             Self::Noisy(noisy) => noisy.table.iter().map(PathBuf::as_path).collect(),
             Self::Pgc(pgc) => vec![&pgc.encoder, &pgc.head],
             Self::Tracked(tracked) => vec![&tracked.encoder, &tracked.head],
-            Self::EndToEnd(network) => vec![&network.weights],
+            Self::Baseline(network) => vec![&network.weights],
             Self::Cached(cached) => vec![&cached.file],
         }
     }
@@ -311,7 +311,7 @@ impl PoseSourceConfig {
     /// True if poses are estimated from the sweep's points.
     #[must_use]
     pub fn looks_at_sweeps(&self) -> bool {
-        matches!(self, Self::Pgc(_) | Self::Tracked(_) | Self::EndToEnd(_))
+        matches!(self, Self::Pgc(_) | Self::Tracked(_) | Self::Baseline(_))
     }
 
     /// Sets the source up and reads its files; networks compute by `inference`.
@@ -325,7 +325,7 @@ impl PoseSourceConfig {
             Self::Noisy(config) => Box::new(NoisyPose::new(config)?),
             Self::Pgc(config) => Box::new(LocalizedPose::pgc(config, inference)?),
             Self::Tracked(config) => Box::new(TrackedPose::load(config, inference)?),
-            Self::EndToEnd(config) => Box::new(LocalizedPose::end_to_end(config, inference)?),
+            Self::Baseline(config) => Box::new(LocalizedPose::baseline(config, inference)?),
             Self::Cached(config) => Box::new(CachedPose::new(config)?),
         })
     }
@@ -366,8 +366,8 @@ mod tests {
         assert_eq!(config.name(), "pgc");
         let message = config.build(Inference::default()).unwrap_err().to_string();
         assert!(message.starts_with("e.safetensors"), "{message}");
-        let config: PoseSourceConfig = serde_saphyr::from_str("end_to_end:\n  weights: w.safetensors\n").unwrap();
+        let config: PoseSourceConfig = serde_saphyr::from_str("baseline:\n  weights: w.safetensors\n").unwrap();
         let message = config.build(Inference::default()).unwrap_err().to_string();
-        assert!(config.name() == "end_to_end" && message.starts_with("w.safetensors"), "{message}");
+        assert!(config.name() == "baseline" && message.starts_with("w.safetensors"), "{message}");
     }
 }

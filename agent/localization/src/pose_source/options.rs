@@ -3,7 +3,7 @@
 use clap::{ArgMatches, Args, Command, FromArgMatches, ValueEnum};
 use protocol::config::{document, options_of};
 
-use super::{CachedPoseConfig, EndToEndPoseConfig, NoisyPoseConfig, PgcConfig, PoseSourceConfig, TrackedPoseConfig};
+use super::{BaselinePoseConfig, CachedPoseConfig, NoisyPoseConfig, PgcConfig, PoseSourceConfig, TrackedPoseConfig};
 
 /// Option that chooses the source.
 #[derive(Debug, clap::Args)]
@@ -25,8 +25,8 @@ enum Kind {
     Pgc,
     /// Estimated by PGC and followed from sweep to sweep.
     Tracked,
-    /// Estimated from the LiDAR sweep alone, by a network that was trained end to end.
-    EndToEnd,
+    /// Estimated from the LiDAR sweep alone, by a baseline of the paper: SGLoc, DiffLoc or HypLiLoc.
+    SgLoc,
     /// Read from a table that `agent localize` wrote.
     Cached,
 }
@@ -38,7 +38,7 @@ impl PoseSourceConfig {
             Self::Noisy(_) => Kind::Noisy,
             Self::Pgc(_) => Kind::Pgc,
             Self::Tracked(_) => Kind::Tracked,
-            Self::EndToEnd(_) => Kind::EndToEnd,
+            Self::Baseline(_) => Kind::Baseline,
             Self::Cached(_) => Kind::Cached,
         }
     }
@@ -49,7 +49,7 @@ impl PoseSourceConfig {
             Kind::Noisy => Self::Noisy(NoisyPoseConfig::default()),
             Kind::Pgc => Self::Pgc(PgcConfig::default()),
             Kind::Tracked => Self::Tracked(TrackedPoseConfig::default()),
-            Kind::EndToEnd => Self::EndToEnd(EndToEndPoseConfig::default()),
+            Kind::Baseline => Self::Baseline(BaselinePoseConfig::default()),
             Kind::Cached => Self::Cached(CachedPoseConfig::default()),
         }
     }
@@ -79,7 +79,7 @@ impl FromArgMatches for PoseSourceConfig {
                 (tracked.encoder, tracked.head) = (networks.encoder, networks.head);
                 tracked.update_from_arg_matches(matches)
             }
-            Self::EndToEnd(network) => network.update_from_arg_matches(matches),
+            Self::Baseline(network) => network.update_from_arg_matches(matches),
             Self::Cached(table) => table.update_from_arg_matches(matches),
         }
     }
@@ -96,7 +96,7 @@ impl Args for PoseSourceConfig {
         let command = TrackedPoseConfig::augment_args_for_update(command);
         let tracking = serde_json::json!({ "tracking": TrackedPoseConfig::default() });
         let command = document(command, options_of::<TrackedPoseConfig>(), &tracking);
-        let command = EndToEndPoseConfig::augment_args_for_update(command);
+        let command = BaselinePoseConfig::augment_args_for_update(command);
         CachedPoseConfig::augment_args_for_update(command)
     }
 
@@ -133,7 +133,7 @@ mod tests {
         assert_eq!((pgc.encoder.to_str(), pgc.head.to_str()), (Some("e"), Some("h")));
         let message = parsed(&["--pose-source=pgc", "--encoder=e"]).validate().unwrap_err().to_string();
         assert!(message.contains("pgc.head is empty") && message.contains("--head"), "{message}");
-        assert!(parsed(&["--pose-source=end_to_end", "--end-to-end=w"]).validate().is_ok());
+        assert!(parsed(&["--pose-source=baseline", "--baseline=w"]).validate().is_ok());
         assert!(parsed(&["--pose-source=cached", "--poses=p.csv"]).validate().is_ok());
     }
 

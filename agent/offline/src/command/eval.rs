@@ -12,7 +12,7 @@ use agent_offline::sweep_database::read_database;
 use anyhow::Context;
 use clap::ValueEnum;
 use dataset::{self, LeftOut};
-use localization::competitors::{LightLoc, Retrieval, load_competitor};
+use localization::baselines::{LightLoc, Retrieval, load_baseline};
 use localization::pgc::confidence::{CONFIDENCE_KEY, Confidence, ConfidenceModel, FitReport, check_good_loss};
 use localization::pgc::pose_solver::{PoseSolver, Solver};
 use localization::pgc::wrong_place::wrong_place_hint;
@@ -52,11 +52,11 @@ pub(crate) struct Args {
         default_value = "deploy/weights/pgc-town1.safetensors"
     )]
     head: Vec<SceneHeadFile>,
-    /// Weights of a competitor (`agent train end-to-end`, `diffloc`, `hypliloc`), instead of encoder and head.
+    /// Weights of a baseline (`agent train sgloc`, `diffloc`, `hypliloc`), instead of encoder and head.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["encoder", "head", "fit_confidence"])]
-    end_to_end: Option<PathBuf>,
+    baseline: Option<PathBuf>,
     /// Leave out what PGC adds to LightLoc: predicted error, refinement and confidence.
-    #[arg(long, conflicts_with_all = ["end_to_end", "fit_confidence", "tracked"])]
+    #[arg(long, conflicts_with_all = ["baseline", "fit_confidence", "tracked"])]
     lightloc: bool,
     /// Answer with the pose of the sweep of these drives that the encoder's features find most alike, the floor of
     /// every regression.
@@ -64,7 +64,7 @@ pub(crate) struct Args {
         long,
         value_name = "DIR",
         num_args = 1..,
-        conflicts_with_all = ["end_to_end", "lightloc", "fit_confidence", "tracked", "solver"]
+        conflicts_with_all = ["baseline", "lightloc", "fit_confidence", "tracked", "solver"]
     )]
     retrieval: Vec<PathBuf>,
     /// Register every sweep against a point-cloud map of these drives through the same scene (ICP), starting at the
@@ -73,7 +73,7 @@ pub(crate) struct Args {
         long,
         value_name = "DIR",
         num_args = 1..,
-        conflicts_with_all = ["encoder", "head", "end_to_end", "lightloc", "retrieval", "fit_confidence", "solver"]
+        conflicts_with_all = ["encoder", "head", "baseline", "lightloc", "retrieval", "fit_confidence", "solver"]
     )]
     icp_map: Vec<PathBuf>,
     /// Distance between two sweeps on that point-cloud map, metres.
@@ -81,7 +81,7 @@ pub(crate) struct Args {
     map_spacing: f64,
     /// Follow each vehicle from sweep to sweep (pose source tracked), and localize every sweep by itself beside it;
     /// files are written of the tracked poses.
-    #[arg(long, conflicts_with_all = ["end_to_end", "icp_map", "fit_confidence"])]
+    #[arg(long, conflicts_with_all = ["baseline", "icp_map", "fit_confidence"])]
     tracked: bool,
     /// Settings of the tracker.
     #[command(flatten)]
@@ -203,7 +203,7 @@ impl Args {
 
     /// True unless another method takes the place of the head.
     fn uses_head(&self) -> bool {
-        self.icp_map.is_empty() && self.end_to_end.is_none()
+        self.icp_map.is_empty() && self.baseline.is_none()
     }
 
     fn inference(&self) -> Result<Inference, BadInput> {
@@ -228,8 +228,8 @@ impl Args {
             Search::Sc2pcr => Solver::Sc2Pcr(Sc2PcrConfig::default()),
         };
         let plain = PoseSolver { solver: solver.clone(), ..PoseSolver::default() };
-        if let Some(weights) = &self.end_to_end {
-            return load_competitor(weights, inference.device, plain).map_err(BadInput::of);
+        if let Some(weights) = &self.baseline {
+            return load_baseline(weights, inference.device, plain).map_err(BadInput::of);
         }
         let load = if self.fit_confidence { Localizer::load_without_confidence } else { Localizer::load };
         let mut localizer = load(&self.encoder(head), head, inference).map_err(BadInput::of)?;

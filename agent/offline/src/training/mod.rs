@@ -4,7 +4,6 @@
 mod contrast;
 mod diffloc_training;
 mod encoder_training;
-mod end_to_end_training;
 mod error;
 mod feature_cache;
 mod hypliloc_training;
@@ -13,12 +12,12 @@ mod pairs;
 mod redundancy;
 mod scene_training;
 mod scene_validation;
+mod sgloc_training;
 mod sweep_store;
 mod turned_sweep;
 
 pub use diffloc_training::{DiffLocAccuracy, DiffLocReport, DiffLocSummary, DiffLocTrainConfig, train_diffloc};
 pub use encoder_training::{EncoderAccuracy, EncoderReport, EncoderSummary, EncoderTrainConfig, train_encoder};
-pub use end_to_end_training::{EncoderStart, EndToEndReport, EndToEndTrainConfig, train_end_to_end};
 pub use error::LocalizerTrainError;
 pub(crate) use feature_cache::FeatureCache;
 pub use feature_cache::SweepAugmentation;
@@ -30,5 +29,6 @@ pub use redundancy::{LeaveOut, RedundancyConfig};
 pub use scene_training::{SceneReport, SceneSummary, SceneTrainConfig, train_scene};
 pub(crate) use scene_training::{SceneSweeps, train_scene_on};
 pub use scene_validation::SceneAccuracy;
+pub use sgloc_training::{SgLocReport, SgLocTrainConfig, train_sgloc};
 pub(crate) use sweep_store::{SweepList, yaw};
 pub(crate) use turned_sweep::CELLS;

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use agent_offline::training::{DiffLocAccuracy, DiffLocReport, DiffLocTrainConfig, train_diffloc};
-use localization::competitors::diffloc::DiffLocConfig;
+use localization::baselines::diffloc::DiffLocConfig;
 use perception::train::{AdamWConfig, ModelCard, RunConfig, TrainingBar, TrainingOptions};
 
 use super::options::{bad, check_folders, print_left_out, run_config};
@@ -13,7 +13,7 @@ const WEIGHT_DECAY: f64 = 0.05;
 /// Largest norm of a gradient.
 const MAX_GRADIENT_NORM: f64 = 1.0;
 
-/// Train DiffLoc, a competitor of the localizer, on one scene; writes checkpoint, curve.csv, weights.safetensors and
+/// Train DiffLoc, a baseline of the localizer, on one scene; writes checkpoint, curve.csv, weights.safetensors and
 /// model-card.md.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {

@@ -1,17 +1,17 @@
-//! `agent train`: the two stages of a localizer.
+//! `agent train`: the two stages of PGC, and the baselines.
 
 mod diffloc;
 mod encoder;
-mod end_to_end;
 mod hypliloc;
 pub(super) mod options;
 mod scene;
+mod sgloc;
 
 use anyhow::Context;
 use bus::malloc_settings;
 use clap::Subcommand;
 
-/// Train a localizer: an encoder once, over many scenes; then a head for each scene.
+/// Train a localizer: an encoder once, over many scenes; then a head for each scene. Or a baseline on one scene.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
     #[command(subcommand)]
@@ -22,7 +22,8 @@ pub(crate) struct Args {
 enum Stage {
     Encoder(encoder::Args),
     Scene(scene::Args),
-    EndToEnd(end_to_end::Args),
+    #[command(name = "sgloc")]
+    SgLoc(sgloc::Args),
     #[command(name = "diffloc")]
     DiffLoc(diffloc::Args),
     #[command(name = "hypliloc")]
@@ -35,7 +36,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     match &args.stage {
         Stage::Encoder(args) => encoder::run(args),
         Stage::Scene(args) => scene::run(args),
-        Stage::EndToEnd(args) => end_to_end::run(args),
+        Stage::SgLoc(args) => sgloc::run(args),
         Stage::DiffLoc(args) => diffloc::run(args),
         Stage::HypLiLoc(args) => hypliloc::run(args),
     }

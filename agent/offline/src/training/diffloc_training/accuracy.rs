@@ -3,7 +3,7 @@
 use tch::{Kind, TchError, Tensor, no_grad};
 
 use super::images::{Normalisation, SweepImages};
-use localization::competitors::diffloc::{CHANNELS, DiffLoc, Windows};
+use localization::baselines::diffloc::{CHANNELS, DiffLoc, Windows};
 
 /// Sweeps that are encoded together.
 const BATCH: i64 = 64;

@@ -5,7 +5,7 @@ use std::f64::consts::TAU;
 use tch::{Kind, TchError, Tensor};
 
 use super::images::{Normalisation, SweepBatch};
-use localization::competitors::diffloc::{CHANNELS, RangeImageConfig, UNITS};
+use localization::baselines::diffloc::{CHANNELS, RangeImageConfig, UNITS};
 
 /// Deviation of the relative error of a range.
 const RANGE_NOISE: f64 = 0.002;

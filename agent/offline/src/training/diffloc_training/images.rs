@@ -9,7 +9,7 @@ use tch::{Device, Kind, TchError, Tensor, no_grad};
 
 use crate::training::sweep_store::heading_rad;
 use crate::training::{LocalizerTrainError, SweepList};
-use localization::competitors::diffloc::{CHANNELS, RangeImageConfig, UNITS};
+use localization::baselines::diffloc::{CHANNELS, RangeImageConfig, UNITS};
 use perception::train::{Prefetch, RunConfig};
 
 /// Channels of a stored image: those of the network, and 1 where a movable object is seen.

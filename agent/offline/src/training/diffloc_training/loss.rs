@@ -3,7 +3,7 @@
 use tch::{Kind, Reduction, TchError, Tensor};
 
 use super::augmentation::{Augmented, static_tokens};
-use localization::competitors::diffloc::{CHANNELS, DiffLoc, Windows};
+use localization::baselines::diffloc::{CHANNELS, DiffLoc, Windows};
 
 /// Noise levels and noises that are drawn for each window: the denoiser costs little beside the encoder.
 const DRAWS: i64 = 8;

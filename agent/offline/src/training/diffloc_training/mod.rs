@@ -15,7 +15,7 @@ use tch::{Cuda, Device, Tensor};
 
 use super::error::LocalizerTrainError;
 use super::sweep_store::SweepList;
-use localization::competitors::diffloc::{DiffLoc, DiffLocConfig, DiffLocLocalizer};
+use localization::baselines::diffloc::{DiffLoc, DiffLocConfig, DiffLocLocalizer};
 use perception::train::{RunConfig, Trained, Trainer};
 use perception::weights::{CONFIG_KEY, KIND_KEY};
 

@@ -5,7 +5,7 @@ use std::f64::consts::TAU;
 use tch::{Kind, TchError, Tensor};
 
 use super::examples::Truth;
-use localization::competitors::hypliloc::{COLUMNS, InputBatch, roll_columns};
+use localization::baselines::hypliloc::{COLUMNS, InputBatch, roll_columns};
 
 /// Standard deviation of points and ranges, metres.
 const JITTER_M: f64 = 0.05;
@@ -52,7 +52,7 @@ mod tests {
     use tch::Device;
 
     use super::*;
-    use localization::competitors::hypliloc::SweepInput;
+    use localization::baselines::hypliloc::SweepInput;
 
     /// A wall of 20 degrees at 40 m, to the front left of the sensor.
     fn wall() -> Vec<[f32; 3]> {

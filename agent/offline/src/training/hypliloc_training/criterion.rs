@@ -4,7 +4,7 @@ use tch::nn::{self, Init};
 use tch::{Kind, TchError, Tensor};
 
 use super::examples::Truth;
-use localization::competitors::hypliloc::{BranchPoses, NormalisedPoses};
+use localization::baselines::hypliloc::{BranchPoses, NormalisedPoses};
 
 /// Logarithms of the variances of position and heading at the start.
 const START: [f32; 2] = [0.0, -3.0];

@@ -8,7 +8,7 @@ use tch::{Kind, TchError, Tensor};
 
 use crate::training::LocalizerTrainError;
 use crate::training::sweep_store::{SweepList, heading_rad};
-use localization::competitors::hypliloc::{InputBatch, RANGE_M, SweepInput};
+use localization::baselines::hypliloc::{InputBatch, RANGE_M, SweepInput};
 use perception::train::{DataListing, Prefetch, RunConfig};
 
 /// Sweeps that are copied onto the device together.

@@ -12,8 +12,8 @@ use tch::nn::VarStore;
 use tch::{Cuda, Kind, Tensor};
 
 use super::error::LocalizerTrainError;
-use localization::competitors::HypLiLocLocalizer;
-use localization::competitors::hypliloc::{HypLiLoc, HypLiLocConfig};
+use localization::baselines::HypLiLocLocalizer;
+use localization::baselines::hypliloc::{HypLiLoc, HypLiLocConfig};
 use perception::train::{RunConfig, Trained, Trainer};
 use perception::weights::{CONFIG_KEY, KIND_KEY};
 
@@ -113,7 +113,7 @@ pub fn train_hypliloc(
 mod tests {
     use std::path::Path;
 
-    use localization::competitors::load_competitor;
+    use localization::baselines::load_baseline;
     use localization::pgc::pose_solver::PoseSolver;
     use perception::train::Length;
     use protocol::PointCloud;
@@ -147,7 +147,7 @@ mod tests {
         let trained = train_hypliloc(&resumed, &mut |_| ()).unwrap();
         assert_eq!(trained.steps, 3);
         assert!(trained.weights.metadata().unwrap().len() < 10_000_000);
-        let mut localizer = load_competitor(&trained.weights, Device::Cpu, PoseSolver::default()).unwrap();
+        let mut localizer = load_baseline(&trained.weights, Device::Cpu, PoseSolver::default()).unwrap();
         let wall = (0..4000).map(|k| [(k % 60) as f32 - 30.0, 9.0, (k / 60) as f32 * 0.1, 0.2]);
         let answer = localizer.localize(&PointCloud { xyzi: wall.collect() }).unwrap();
         assert!(answer.estimate.world_from_cav().is_some(), "{answer:?}");

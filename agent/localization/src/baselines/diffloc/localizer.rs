@@ -11,7 +11,7 @@ use super::config::DiffLocConfig;
 use super::denoiser::Windows;
 use super::network::DiffLoc;
 use super::range_image::CHANNELS;
-use crate::competitors::end_to_end_localizer::{FULL_CONFIDENCE, no_pose, upright};
+use crate::baselines::regressed_pose::{FULL_CONFIDENCE, no_pose, upright};
 use crate::pgc::pose_solver::MIN_CELLS;
 use crate::pgc::{Localization, Localize, LocalizerError, LocalizerTimes};
 use perception::weights::Weights;
@@ -97,8 +97,8 @@ mod tests {
     use std::path::PathBuf;
 
     use super::*;
-    use crate::competitors::diffloc::RangeImageConfig;
-    use crate::competitors::load_competitor;
+    use crate::baselines::diffloc::RangeImageConfig;
+    use crate::baselines::load_baseline;
     use crate::pgc::pose_solver::PoseSolver;
     use perception::weights::{CONFIG_KEY, KIND_KEY, Precision, save};
 
@@ -151,7 +151,7 @@ mod tests {
         });
         let folder = tempfile::tempdir().unwrap();
         let path = write(folder.path(), &variables, DiffLocLocalizer::KIND);
-        let mut localizer = load_competitor(&path, Device::Cpu, PoseSolver::default()).unwrap();
+        let mut localizer = load_baseline(&path, Device::Cpu, PoseSolver::default()).unwrap();
         let answer = localizer.localize(&sweep()).unwrap();
         let pose = answer.estimate.world_from_cav().unwrap();
         let expected = [1200.0, -1920.0, 26.0];
@@ -186,7 +186,7 @@ mod tests {
         let path = write(folder.path(), &variables, "scene encoder");
         for message in [
             DiffLocLocalizer::load(&path, Device::Cpu).unwrap_err().to_string(),
-            load_competitor(&path, Device::Cpu, PoseSolver::default()).unwrap_err().to_string(),
+            load_baseline(&path, Device::Cpu, PoseSolver::default()).unwrap_err().to_string(),
         ] {
             assert!(message.contains("weights.safetensors") && message.contains("scene encoder"), "{message}");
         }

@@ -10,7 +10,7 @@ use tch::{Device, Kind, TchError, Tensor, no_grad};
 use super::config::HypLiLocConfig;
 use super::network::HypLiLoc;
 use super::sweep_input::{InputBatch, SweepInput};
-use crate::competitors::end_to_end_localizer::{FULL_CONFIDENCE, no_pose, upright};
+use crate::baselines::regressed_pose::{FULL_CONFIDENCE, no_pose, upright};
 use crate::pgc::{Localization, Localize, LocalizerError, LocalizerTimes};
 use perception::weights::Weights;
 
@@ -96,7 +96,8 @@ mod tests {
     use perception::weights::{CONFIG_KEY, KIND_KEY, Precision, save};
 
     use super::*;
-    use crate::competitors::{EndToEndLocalizer, load_competitor};
+    use crate::baselines::load_baseline;
+    use crate::baselines::sgloc::SgLocLocalizer;
     use crate::pgc::pose_solver::PoseSolver;
 
     fn config() -> HypLiLocConfig {
@@ -135,7 +136,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = write(folder.path(), &config(), [0.5, -0.25, 2.0], [0.0, 0.3]);
         assert_eq!(HypLiLocLocalizer::load(&path, Device::Cpu).unwrap().config(), &config());
-        let mut localizer = load_competitor(&path, Device::Cpu, PoseSolver::default()).unwrap();
+        let mut localizer = load_baseline(&path, Device::Cpu, PoseSolver::default()).unwrap();
         let answer = localizer.localize(&sweep()).unwrap();
         let pose = answer.estimate.world_from_cav().unwrap();
         let expected = [1050.0, -2050.0, 32.0];
@@ -164,8 +165,8 @@ mod tests {
         let path = write(folder.path(), &flat, [0.0; 3], [0.0; 2]);
         let message = HypLiLocLocalizer::load(&path, Device::Cpu).unwrap_err().to_string();
         assert!(message.contains("scale_m is [0.0, 0.0, 0.0]"), "{message}");
-        let message = EndToEndLocalizer::load(&path, Device::Cpu).unwrap_err().to_string();
-        assert!(message.contains("\"HypLiLoc\"") && message.contains("\"end to end\""), "{message}");
+        let message = SgLocLocalizer::load(&path, Device::Cpu, PoseSolver::default()).unwrap_err().to_string();
+        assert!(message.contains("\"HypLiLoc\"") && message.contains("\"SGLoc\""), "{message}");
         let other = folder.path().join("other.safetensors");
         let about = BTreeMap::from([(KIND_KEY.to_owned(), "scene encoder".to_owned())]);
         save(&other, &VarStore::new(Device::Cpu), &about, Precision::Single).unwrap();

@@ -1,5 +1,4 @@
-//! Head after SGLoc (Li et al. 2023): attention between scales, residual layers with batch normalisation, and a shift
-//! of each cell's own position.
+//! Head: attention between scales, residual layers with batch normalisation, and a shift of each cell's own position.
 
 use tch::nn::{self, BatchNormConfig, ModuleT};
 use tch::{Kind, TchError, Tensor};

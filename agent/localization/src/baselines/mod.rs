@@ -1,0 +1,14 @@
+//! Baselines of the paper's localization tables, small, and the floor that a regression has to beat.
+
+mod by_kind;
+pub mod diffloc;
+pub mod hypliloc;
+mod lightloc;
+mod regressed_pose;
+mod retrieval;
+pub mod sgloc;
+
+pub use by_kind::load_baseline;
+pub use hypliloc::HypLiLocLocalizer;
+pub use lightloc::LightLoc;
+pub use retrieval::{DescribedSweep, Retrieval, SweepDatabase};

@@ -1,0 +1,26 @@
+//! Pose that a network regresses directly.
+
+use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
+use protocol::{NoPoseReason, PoseEstimate};
+
+use crate::pgc::localize::{Localization, LocalizerTimes};
+
+/// Confidence of a pose that is regressed directly: such a network predicts no error.
+pub(super) const FULL_CONFIDENCE: f32 = 1.0;
+
+pub(super) fn no_pose(reason: NoPoseReason, times: LocalizerTimes) -> Localization {
+    Localization::from_estimate(PoseEstimate::NoPose { reason, inlier_count: 0 }, times)
+}
+
+/// Position relative to the origin, cosine and sine of the heading; `None` if that is no pose.
+pub(super) fn upright(answer: &[f32], origin_m: [f64; 3]) -> Option<Isometry3<f64>> {
+    let &[x, y, z, cosine, sine] = answer else { return None };
+    let [x, y, z, cosine, sine] = [x, y, z, cosine, sine].map(f64::from);
+    // Cosine and sine have length 1, unless the network gives no heading.
+    let is_pose = [x, y, z].iter().all(|axis| axis.is_finite()) && cosine.hypot(sine) > 0.5;
+    is_pose.then(|| {
+        let position = Vector3::new(x, y, z) + Vector3::from(origin_m);
+        let heading = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), sine.atan2(cosine));
+        Isometry3::from_parts(Translation3::from(position), heading)
+    })
+}

@@ -1,0 +1,62 @@
+//! Network: the encoder of the cells of a sweep, and the head that regresses their scene coordinates.
+
+use tch::nn;
+use tch::{TchError, Tensor};
+
+use super::SgLocConfig;
+use super::head::SgLocHead;
+use crate::pgc::error::LocalizerError;
+use crate::pgc::feature_norm::FeatureNorm;
+use crate::pgc::scene_encoder::SceneEncoder;
+
+/// Encoder and head of one scene.
+#[derive(Debug)]
+pub struct SgLoc {
+    config: SgLocConfig,
+    encoder: SceneEncoder,
+    norm: FeatureNorm,
+    head: SgLocHead,
+}
+
+impl SgLoc {
+    /// Builds the layers below `path`.
+    ///
+    /// # Errors
+    /// [`LocalizerError::Config`] names the field that is wrong.
+    pub fn new(path: &nn::Path<'_>, config: &SgLocConfig) -> Result<Self, LocalizerError> {
+        let encoder = SceneEncoder::new(&(path / "encoder"), &config.encoder)?;
+        let below = path / "regressor";
+        let head = SgLocHead::new(&below, &config.encoder);
+        let norm = FeatureNorm::new(&(&below / "norm"), config.encoder.cell_channels());
+        Ok(Self { config: config.clone(), encoder, norm, head })
+    }
+
+    /// Configuration that it was built from.
+    #[must_use]
+    pub fn config(&self) -> &SgLocConfig {
+        &self.config
+    }
+
+    /// Encoder.
+    #[must_use]
+    pub fn encoder(&self) -> &SceneEncoder {
+        &self.encoder
+    }
+
+    /// `[N, 3]` world coordinates relative to the origin, metres, of some cells' features `[N, cell_channels]`, which
+    /// lie at `sensor_m` `[N, 3]` in the sensor frame; `train` as in batch normalisation.
+    ///
+    /// # Errors
+    /// Those of the tensor library.
+    pub fn coordinates(&self, cells: &Tensor, sensor_m: &Tensor, train: bool) -> Result<Tensor, TchError> {
+        self.head.forward(&self.norm.forward(cells)?, sensor_m, train)
+    }
+
+    /// Sets the normalisation from features `[N, cell_channels]`; without it they enter unchanged.
+    ///
+    /// # Errors
+    /// Those of the tensor library.
+    pub fn set_statistics(&mut self, features: &Tensor) -> Result<(), TchError> {
+        self.norm.fit(features)
+    }
+}

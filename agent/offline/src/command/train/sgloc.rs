@@ -1,0 +1,61 @@
+//! `agent train sgloc`: arguments, progress and model card.
+
+use std::path::PathBuf;
+
+use agent_offline::training::{SgLocReport, SgLocTrainConfig, train_sgloc};
+use perception::train::{ModelCard, TrainingBar, TrainingOptions};
+
+use super::options::{check_folders, print_left_out, run_config};
+
+/// Train SGLoc's head on one scene, on a frozen encoder; writes checkpoint, weights.safetensors and model-card.md.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// Folders of sweeps, all of the same scene.
+    #[arg(long, required = true, num_args = 1.., value_name = "DIR")]
+    scenes: Vec<PathBuf>,
+    /// Name of the scene, for messages and the model card.
+    #[arg(long, default_value = "scene")]
+    scene_name: String,
+    /// Weights of the frozen encoder, output of `agent train encoder`.
+    #[arg(long, value_name = "FILE")]
+    encoder: PathBuf,
+    /// Sweeps per step, 400 cells for each.
+    #[arg(long, default_value_t = 12)]
+    batch: usize,
+    /// Highest learning rate.
+    #[arg(long, default_value_t = 2e-3)]
+    lr: f64,
+    #[command(flatten)]
+    options: TrainingOptions,
+}
+
+pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
+    check_folders(&args.scenes)?;
+    let config = SgLocTrainConfig {
+        scenes: args.scenes.clone(),
+        scene_name: args.scene_name.clone(),
+        encoder: args.encoder.clone(),
+        run: run_config(&args.options, args.batch, args.lr)?,
+    };
+    let bar = TrainingBar::of(config.run.length);
+    let mut latest_m = None;
+    let trained = train_sgloc(&config, &mut |report| match *report {
+        SgLocReport::Encoding(done, total) => bar.encoded(done, total),
+        SgLocReport::Stepped { step, share_done, seconds, error_m } => {
+            latest_m = Some(error_m);
+            bar.report(share_done, seconds, &format!("step {step} error {error_m:.2} m"));
+        }
+    })?;
+    bar.finish();
+    print_left_out(&bar, &trained.data);
+    let title = format!("SGLoc, small, of {}", config.scene_name);
+    let mut card =
+        ModelCard::new(&title, "Head on the features of a frozen encoder, trained on the sweeps of one scene.");
+    card.trained(&config.run, &trained, "all sweeps", "sweeps");
+    if let Some(error_m) = latest_m {
+        card.row("mean L1 error of the last steps, training cells", format!("{error_m:.2} m"));
+    }
+    card.write(&config.run.out)?;
+    args.options.print(&trained, &serde_json::json!({}))?;
+    Ok(())
+}
