@@ -103,20 +103,21 @@ pub fn table(all: &[Metrics]) -> String {
     for (name, of) in BY_IOU {
         columns.push(Column::right(&format!("AP@{name}"), all, |metrics| number(of(&metrics.ap_global), 3)));
     }
-    columns.push(Column::right("frame order 0.5", all, |metrics| number(metrics.ap_frame_order.at_50, 3)));
     if is_live {
         let all_ticks = |metrics: &Metrics| number(metrics.ap_unanswered_empty.at_50, 3);
         let streaming = |metrics: &Metrics| number(metrics.ap_streaming.and_then(|ap| ap.at_50), 3);
-        columns.push(Column::right("all ticks 0.5", all, all_ticks));
-        columns.push(Column::right("streaming 0.5", all, streaming));
+        columns.push(Column::right("AP@0.5 all", all, all_ticks));
+        columns.push(Column::right("sAP@0.5", all, streaming));
+    } else {
+        columns.push(Column::right("frame order 0.5", all, |metrics| number(metrics.ap_frame_order.at_50, 3)));
     }
     if all.iter().any(|metrics| metrics.contribution.sent > 0) {
         let fused = |metrics: &Metrics| number(metrics.contribution.fused_per_frame, 2);
-        columns.push(Column::right("neighbours fused per frame", all, fused));
+        columns.push(Column::right("fused", all, fused));
     }
-    columns.push(Column::right("pose error m", all, |metrics| number(metrics.pose.mean_m, 2)));
-    columns.push(Column::right("latency ms p50/p95", all, latency));
-    columns.push(Column::right("bytes per neighbour", all, wire_bytes));
+    columns.push(Column::right("pose m", all, |metrics| number(metrics.pose.mean_m, 2)));
+    columns.push(Column::right("latency ms", all, latency));
+    columns.push(Column::right("bytes", all, wire_bytes));
     lines(&columns, all.len()) + &comparison(all)
 }
 
@@ -129,9 +130,7 @@ fn comparison(all: &[Metrics]) -> String {
     let mut text = String::new();
     if all.windows(2).any(|pair| pair[0].frames != pair[1].frames) {
         let compare = match all.iter().any(|metrics| metrics.ap_streaming.is_some()) {
-            true => {
-                "compare \"all ticks\" and \"streaming\", in which unanswered ticks count, and not AP over other frames"
-            }
+            true => "compare \"AP@0.5 all\" and sAP@0.5, in which unanswered ticks count, and not AP over other frames",
             false => "their AP cannot be compared",
         };
         let _ = writeln!(text, "\nwarning: rows are evaluated over different frames: {compare}");
@@ -255,9 +254,9 @@ mod tests {
         let ego_only = Metrics { contribution, ..metrics("none", Some(0.7)) };
         assert!(!table(&[ego_only]).contains("arrived in time"), "it fuses nothing in any case");
         let text = table(&[Metrics { contribution, latency_ms, ..metrics("max", Some(0.8)) }]);
-        assert!(text.contains("neighbours fused per frame") && text.contains("0.05"), "{text}");
+        assert!(text.contains("  fused  ") && text.contains("0.05"), "{text}");
         assert!(text.contains("max: of 38 feature maps of 3.1 MB each 2 arrived in time"), "{text}");
         assert!(!text.contains(" / "), "no latency is known: {text}");
-        assert!(!table(&[metrics("max", None)]).contains("neighbours fused"), "nothing was transmitted");
+        assert!(!table(&[metrics("max", None)]).contains("fused"), "nothing was transmitted");
     }
 }
