@@ -1,6 +1,7 @@
 //! The four cameras of the vehicles: ahead, to both sides and back, 100 degrees wide, rendered from the geometry that
 //! the LiDAR hits.
 
+mod ground_paint;
 mod paint;
 mod png_image;
 mod shading;
@@ -12,8 +13,8 @@ use dataset::camera_files::body_from_optical;
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 use protocol::{Camera, CameraMetadata, ImageFormat, Pinhole};
 
+pub(super) use ground_paint::GroundPaint;
 pub(super) use paint::{Paint, of_shape, of_vehicle};
-pub(super) use shading::GroundPaint;
 
 use super::lidar::LIDAR_MOUNT_M;
 use super::raycast::{Body, Caster, Placement, RayPattern, Surface, Sweep};

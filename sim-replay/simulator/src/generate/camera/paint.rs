@@ -17,6 +17,8 @@ pub(crate) enum Paint {
     Plain(Colour),
 }
 
+/// Colour of lying and falling snow.
+pub(super) const SNOW: Colour = [0.88, 0.89, 0.92];
 /// Colours of vehicles.
 const VEHICLES: [Colour; 8] = [
     [0.85, 0.85, 0.86],
@@ -53,4 +55,9 @@ pub(crate) fn of_shape(shape: &BodyShape, place: u64) -> Paint {
             if height_m > BUILDING_M { Paint::Wall(colour) } else { Paint::Plain(colour.map(|part| 0.8 * part)) }
         }
     }
+}
+
+/// `a`, by a share towards `b`.
+pub(super) fn mix(a: Colour, b: Colour, share: f32) -> Colour {
+    std::array::from_fn(|part| a[part] + (b[part] - a[part]) * share)
 }

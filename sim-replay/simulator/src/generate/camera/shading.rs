@@ -1,22 +1,17 @@
 //! Shading of a camera image: material, sun and air along the ray of every pixel.
 
-use std::collections::HashMap;
-
 use nalgebra::{Matrix3, Vector3};
 
-use super::paint::{Colour, Paint};
+use super::ground_paint::GroundPaint;
+use super::paint::{Colour, Paint, SNOW, mix};
 use crate::generate::raycast::{Caster, GROUND, MISS, RangeImage, SkewedColumn, Sweep};
 use crate::generate::weather::Weather;
-use crate::generate::world::World;
 use support::random::SplitMix64;
 
 /// Direction towards the sun in the world.
 const SUN: [f32; 3] = [0.53, -0.33, 0.78];
 /// Share of the light that comes from the sky.
 const AMBIENT: f32 = 0.45;
-const ASPHALT: Colour = [0.26, 0.26, 0.27];
-const GRASS: Colour = [0.33, 0.40, 0.20];
-const SNOW: Colour = [0.88, 0.89, 0.92];
 const WINDOW: Colour = [0.16, 0.20, 0.26];
 const ZENITH: Colour = [0.35, 0.55, 0.86];
 const HORIZON: Colour = [0.78, 0.85, 0.92];
@@ -24,47 +19,8 @@ const CLOUD: Colour = [0.74, 0.76, 0.78];
 /// Height of a storey, and the parts of it that are window, metres and shares.
 const STOREY_M: f32 = 3.0;
 const WINDOW_ROWS: [f32; 2] = [0.35, 0.8];
-/// Edge of a cell of ground of one material, metres.
-const GROUND_CELL_M: f64 = 0.4;
-/// Distance from a lane's centre line that is still road beside its half width, metres.
-const SHOULDER_M: f64 = 0.3;
-/// Largest lane that is looked for, metres.
-const WIDEST_LANE_M: f64 = 6.0;
 /// Share of pixels with a flake before it, in snow.
 const FLAKES: f64 = 0.01;
-
-/// Material of the ground, looked up once for each cell.
-pub(crate) struct GroundPaint<'w> {
-    world: &'w World<'w>,
-    is_road: HashMap<[i32; 2], bool>,
-}
-
-impl<'w> GroundPaint<'w> {
-    pub(crate) fn new(world: &'w World<'w>) -> Self {
-        Self { world, is_road: HashMap::new() }
-    }
-
-    fn colour(&mut self, place_m: &Vector3<f64>, weather: Weather) -> Colour {
-        let cell = [place_m.x, place_m.y].map(|axis| (axis / GROUND_CELL_M).floor() as i32);
-        let world = self.world;
-        let is_road = *self.is_road.entry(cell).or_insert_with(|| {
-            let middle = cell.map(|axis| (f64::from(axis) + 0.5) * GROUND_CELL_M);
-            let lanes = &world.map_model.lanes;
-            let nearest = world.lane_index.nearest(lanes, middle, WIDEST_LANE_M, None, None);
-            nearest.is_some_and(|at| at.offset_m.abs() < lanes.lane(at.lane).width_m / 2.0 + SHOULDER_M)
-        });
-        // A little of each cell's own, so that flat ground shows its distance.
-        let seed = (u64::from(cell[0].cast_unsigned()) << 32) | u64::from(cell[1].cast_unsigned());
-        let grain = 0.94 + 0.12 * SplitMix64::new(seed).unit() as f32;
-        let colour = match (weather, is_road) {
-            (Weather::Snow, false) => SNOW,
-            (Weather::Snow, true) => mix(ASPHALT, SNOW, 0.55),
-            (_, true) => ASPHALT,
-            (_, false) => GRASS,
-        };
-        colour.map(|part| part * grain)
-    }
-}
 
 /// A rendered image.
 pub(super) struct Rendered {
@@ -198,8 +154,4 @@ impl<'a> Shader<'a> {
         let length = towards_sensor.norm();
         if length > 0.0 { self.world_from_sensor * towards_sensor / length } else { Vector3::z() }
     }
-}
-
-fn mix(a: Colour, b: Colour, share: f32) -> Colour {
-    std::array::from_fn(|part| a[part] + (b[part] - a[part]) * share)
 }
