@@ -178,7 +178,7 @@ struct Watched {
 
 /// Arrival time of each sweep at the ego's agent, by capture time. An agent on another host writes none.
 fn swept(log: &Path) -> BTreeMap<u64, u64> {
-    agent::sweep_log::read(log).unwrap_or_else(|error| {
+    support::sweep_log::read(log).unwrap_or_else(|error| {
         if error.kind() != std::io::ErrorKind::NotFound {
             tracing::warn!("{}: {error}; frames.csv lacks the arrival times of the sweeps", log.display());
         }

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use dataset::average_precision::{Ordering, Scorer};
 use dataset::ground_truth::GroundTruthRule;
-use protocol::{Box3d, CavId, Detections, DropReason, Pose, PoseEstimate, Stamp, Truth};
+use protocol::{Box3d, CavId, Detections, DropReason, Pose, PoseError, PoseEstimate, Stamp, Truth};
 
 use super::frame_record::{FrameRecord, JudgedFrame, StreamedResult};
 use super::live_precision::{Answer, LivePrecision, TickTruth};
@@ -14,7 +14,7 @@ use super::precision::{by_iou, found_by_last, precision_recall_csv};
 use super::stage_stamps::StageStamps;
 use super::true_boxes::true_boxes;
 use super::truth_line::TruthLine;
-use crate::score::metrics::{ByIou, Communication, Latencies, Percentiles, PoseError, PoseErrors};
+use crate::score::metrics::{ByIou, Communication, Latencies, Percentiles, PoseErrors};
 
 /// Gap between two frames beyond which they belong to two scenarios, nanoseconds.
 const SCENARIO_GAP_NANOS: u64 = 10_000_000_000;

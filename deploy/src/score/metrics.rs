@@ -6,8 +6,7 @@ use std::collections::BTreeMap;
 
 use dataset::LeftOut;
 use dataset::evaluation_protocol::EvaluationProtocol;
-pub use localization::pose_error::PoseError;
-use protocol::{CavId, Counts, DropReason, Ledger};
+use protocol::{CavId, Counts, DropReason, Ledger, PoseError};
 use serde::{Deserialize, Serialize};
 use support::statistics::{quantile, sorted};
 

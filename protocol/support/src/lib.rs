@@ -6,6 +6,7 @@
 //! - [`bounded_file`], [`atomic_file`], [`csv_file`]: reads with a limit on their size, atomic writes, CSV.
 //! - [`statistics`], [`stage_times`], [`nanos`]: quantiles and correlations, the stopwatch, durations in nanoseconds.
 //! - [`rounding`]: floats to integers.
+//! - [`sweep_log`]: arrival of each sweep at an agent, for whoever times a run.
 //! - [`random`]: seeds derived from seeds, and draws that depend on the seed only.
 //!
 //! ```
@@ -35,4 +36,5 @@ pub mod shared_files;
 pub mod sibling_program;
 pub mod stage_times;
 pub mod statistics;
+pub mod sweep_log;
 pub mod text_table;

@@ -1,6 +1,6 @@
 //! Error of a pose: distance and angle to the true one.
 
-use protocol::Pose;
+use crate::Pose;
 
 /// Error of one pose.
 #[derive(Debug, Clone, Copy, PartialEq)]
