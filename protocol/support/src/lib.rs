@@ -26,6 +26,7 @@ pub mod atomic_file;
 pub mod bounded_file;
 pub mod cli;
 pub mod command_line;
+mod command_tree;
 pub mod csv_file;
 pub mod nanos;
 pub mod output;
