@@ -59,7 +59,7 @@ impl FrameScores {
     }
 
     /// Continues with the results of another vehicle: in another scenario.
-    pub(crate) fn change_ego(&mut self, ego: &CavId) {
+    pub fn change_ego(&mut self, ego: &CavId) {
         self.ego.clone_from(ego);
         self.live.forget();
     }
@@ -121,7 +121,7 @@ impl FrameScores {
 
     /// Frame for the picture so far: the one with the most neighbours, then true boxes.
     #[must_use]
-    pub(crate) fn showpiece(&self) -> Option<&JudgedFrame> {
+    pub fn showpiece(&self) -> Option<&JudgedFrame> {
         self.best.as_ref()
     }
 
@@ -134,7 +134,7 @@ impl FrameScores {
     /// Precision over recall at the three IoU thresholds as a table, a row per detection by falling score; precision is
     /// made non-increasing in recall, as for [`Self::average_precision`].
     #[must_use]
-    pub(crate) fn precision_recall_csv(&self) -> String {
+    pub fn precision_recall_csv(&self) -> String {
         precision_recall_csv(&self.scorer)
     }
 
@@ -230,7 +230,7 @@ impl FrameScores {
 
     /// Scores a frame whose truth is known already, at once; `poses` are the estimates of all vehicles. The same frame
     /// must not be given to [`Self::truth`], [`Self::result`] and [`Self::pose`].
-    pub(crate) fn judge_whole(
+    pub fn judge_whole(
         &mut self,
         (tick, capture_nanos): (u64, u64),
         latency_ms: Option<f64>,
