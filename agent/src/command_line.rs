@@ -1,6 +1,5 @@
 //! Command line of the vehicle's process.
 
-use std::io;
 use std::process::ExitCode;
 
 use anyhow::Context;
@@ -8,12 +7,22 @@ use bus::BusError;
 use bus::malloc_settings;
 use clap::{Parser, Subcommand};
 use support::cli::{Outcome, exit_code};
-use support::sibling_program::Forwarded;
+use support::sibling_program::Sibling;
 
 use crate::command;
 
-/// Program that carries out the offline subcommands.
-const OFFLINE: &str = "agent-offline";
+/// Subcommands that read data sets.
+pub(crate) const OFFLINE: Sibling = Sibling {
+    program: "agent-offline",
+    subcommands: &[
+        ("eval", "Localize recorded sweeps and compare with their true poses"),
+        ("localize", "Localize recorded sweeps and write their poses to a table"),
+        ("locate", "Find the pose of single point clouds"),
+        ("map", "Make a head for a place from drives through it"),
+        ("quantise", "Prepare a scene head for 8-bit inference"),
+        ("train", "Train the networks of the localization"),
+    ],
+};
 
 /// Agent of one connected vehicle: localizes each LiDAR sweep, computes its BEV features and publishes both.
 #[derive(Debug, Parser)]
@@ -29,35 +38,13 @@ pub(crate) struct Cli {
 #[derive(Debug, Subcommand)]
 enum Command {
     Run(Box<command::run::Args>),
-    /// Localize recorded sweeps and compare with their true poses
-    Eval(Forwarded),
-    /// Localize recorded sweeps and write their poses to a table
-    Localize(Forwarded),
-    /// Find the pose of single point clouds
-    Locate(Forwarded),
-    /// Make a head for a place from drives through it
-    Map(Forwarded),
-    /// Prepare a scene head for 8-bit inference
-    Quantise(Forwarded),
-    /// Train the networks of the localization
-    Train(Forwarded),
 }
 
 impl Command {
     fn run(self) -> anyhow::Result<()> {
-        let offline = |forwarded: Forwarded, name| -> io::Result<()> { Err(forwarded.exec(OFFLINE, name)) };
-        match self {
-            Self::Run(args) => {
-                malloc_settings::ensure(&malloc_settings::KEPT_MEMORY).context("cannot execute this program again")?;
-                command::run::run(*args)
-            }
-            Self::Eval(forwarded) => Ok(offline(forwarded, "eval")?),
-            Self::Localize(forwarded) => Ok(offline(forwarded, "localize")?),
-            Self::Locate(forwarded) => Ok(offline(forwarded, "locate")?),
-            Self::Map(forwarded) => Ok(offline(forwarded, "map")?),
-            Self::Quantise(forwarded) => Ok(offline(forwarded, "quantise")?),
-            Self::Train(forwarded) => Ok(offline(forwarded, "train")?),
-        }
+        let Self::Run(args) = self;
+        malloc_settings::ensure(&malloc_settings::KEPT_MEMORY).context("cannot execute this program again")?;
+        command::run::run(*args)
     }
 }
 

@@ -35,6 +35,5 @@ pub mod config;
 pub mod node;
 pub mod output_filter;
 pub mod rate;
-pub mod sweep_log;
 pub(crate) mod sweep_pairing;
 pub(crate) mod sweep_selection;

@@ -16,11 +16,11 @@ use protocol::{
     CavId, DropReason, Dtype, Gnss, KeyExpr, Lidar, Limits, Pace, PointCloud, PoseEstimate, Role, Stream, Topic, wire,
 };
 use support::nanos;
+use support::sweep_log::SweepLog;
 
 use crate::agent::{Agent, AgentInput, Perception};
 use crate::output_filter::{OutputFilter, Unfiltered};
 use crate::rate::{RateConfig, RateControl, Turn};
-use crate::sweep_log::SweepLog;
 use crate::sweep_pairing::{PairedSweep, SweepPairing, Unused};
 use crate::sweep_selection::{MAX_EGOS, SweepSelection};
 

@@ -1,32 +1,25 @@
-//! Operator's tool: starts and supervises a fleet, runs experiments on it and shows it.
+//! Operator's tool: runs and supervises the processes of a fleet, scores what they publish and shows it. Computes no
+//! network, and links no libtorch.
 //!
-//! - [`scenario`]: the file that describes a run; weights and hashes of its inputs.
 //! - [`score`]: live comparison of detections with ground truth, and message accounting.
 //! - [`operate`]: processes, network, keys, health, the run folder.
-//! - [`run`]: one run, live or in simulation time, and its metrics.
-//! - [`experiment`]: offline evaluation, tables, sweeps and reports.
+//! - [`report`]: pace, latency, stages and resources of a run that has ended.
+//! - [`view`]: a page that shows a run, live or recorded.
 //! - [`ros`]: node of a ROS 2 network.
-//! - [`view`]: a page that shows a run, live or recorded, and its pictures.
 //!
-//! Each uses those before it in this list only; `view` uses `operate` and `score`, `ros` none.
+//! `operate` uses `score`; `report` and `view` use both, `ros` none.
 //!
 //! ```
-//! use deploy::scenario::Scenario;
+//! use deploy::operate::status::{RunStatus, StatusError};
 //!
-//! # fn main() -> Result<(), deploy::scenario::ScenarioError> {
-//! let scenario = Scenario::read("scenarios/demo.yaml".as_ref())?;
-//! assert_eq!(scenario.method.name(), "max");
-//! # Ok(())
-//! # }
+//! let folder = std::env::temp_dir().join(format!("v2vloc-runs-{}", std::process::id()));
+//! assert!(matches!(RunStatus::newest(&folder), Err(StatusError::NoRun(_))));
 //! ```
 
 #![warn(clippy::print_stdout, clippy::print_stderr)]
 
-pub mod experiment;
 pub mod operate;
+pub mod report;
 pub mod ros;
-pub mod run;
-pub mod scenario;
-pub mod schema;
 pub mod score;
 pub mod view;

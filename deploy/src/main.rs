@@ -6,9 +6,10 @@ mod command;
 
 use std::process::ExitCode;
 
+use bus::BusError;
 use clap::Parser;
 use support::cli::exit_code;
-use support::command_line::parse;
+use support::command_line::parse_beside;
 
 /// Collaborative perception without GNSS as a distributed system: run, evaluate and view it.
 #[derive(Debug, Parser)]
@@ -25,7 +26,7 @@ struct CommandLine {
 }
 
 fn main() -> ExitCode {
-    let command_line: CommandLine = parse();
+    let command_line: CommandLine = parse_beside(&command::RUNNER);
     bus::log_to_stderr();
-    exit_code(command_line.command.run(), command::is_bad_input)
+    exit_code(command_line.command.run(), BusError::is_behind)
 }

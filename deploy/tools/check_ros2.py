@@ -365,7 +365,7 @@ def check(programs, scene):
 
 
 def main(folder):
-    missing = [name for name in ["v2vloc", "agent", "ego-fuser", "sim-replay"] if not (pathlib.Path(folder) / name).exists()]
+    missing = [name for name in ["v2vloc", "v2vloc-runner", "agent", "ego-fuser", "sim-replay"] if not (pathlib.Path(folder) / name).exists()]
     if missing:
         print(f"skipped: {folder} has no {', '.join(missing)}", file=sys.stderr)
         return 2

@@ -9,7 +9,7 @@ use std::process::ExitCode;
 use bus::BusError;
 use clap::Parser;
 use support::cli::exit_code;
-use support::command_line::parse;
+use support::command_line::parse_beside;
 
 /// Fuses the views of connected vehicles into boxes around the ego.
 #[derive(Debug, Parser)]
@@ -20,5 +20,5 @@ struct CommandLine {
 }
 
 fn main() -> ExitCode {
-    exit_code(parse::<CommandLine>().command.run(), BusError::is_behind)
+    exit_code(parse_beside::<CommandLine>(&command::OFFLINE).command.run(), BusError::is_behind)
 }

@@ -50,6 +50,13 @@ impl Box3d {
     }
 }
 
+/// True if all corners lie within x, y of the lower and the upper corner of `range_m`, edges included.
+#[must_use]
+pub fn corners_within(corners: &[[f64; 3]; 8], range_m: [f64; 4]) -> bool {
+    let [x_low, y_low, x_high, y_high] = range_m;
+    corners.iter().all(|&[x, y, _]| (x_low..=x_high).contains(&x) && (y_low..=y_high).contains(&y))
+}
+
 /// A box that a detector reports.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Detection {

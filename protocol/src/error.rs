@@ -3,8 +3,8 @@
 use crate::CavId;
 use crate::DropReason;
 use crate::IdError;
+use crate::InvalidPose;
 use crate::Kind;
-use crate::PoseError;
 use crate::header::{HEADER_LEN, MAGIC, WIRE_VERSION};
 
 /// Error of decoding or encoding a message.
@@ -135,7 +135,7 @@ pub enum WireError {
         /// Name of the pose.
         what: &'static str,
         /// Error of the pose.
-        source: PoseError,
+        source: InvalidPose,
     },
     /// A compressed body that does not decompress to the announced size.
     #[error("compressed body of {bytes} bytes, {expected} unpacked: {detail}")]

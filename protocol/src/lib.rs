@@ -100,6 +100,7 @@ mod metadata;
 mod misbehaviour_reason;
 mod point_cloud;
 mod pose;
+mod pose_error;
 mod reconciliation;
 pub mod rotated_iou;
 mod stream;
@@ -111,7 +112,7 @@ pub mod wire;
 pub use access::{Operation, Permission, Principal, PrincipalError, RunScope};
 pub use bev::{BevFeatures, BevGrid};
 pub use body::{Body, BodyShape};
-pub use box3d::{Box3d, Detection};
+pub use box3d::{Box3d, Detection, corners_within};
 pub use codec::{
     ByteLimit, Codec, CodecConfig, Compression, ConfidenceGate, DecodedFeatures, Dtype, EncodedFeatures, LimitedBy,
     RateChoice, RateReason, Selection, Smoothing, encode_features, encode_within,
@@ -131,7 +132,8 @@ pub use message::{
 };
 pub use misbehaviour_reason::MisbehaviourReason;
 pub use point_cloud::{Handedness, PointCloud};
-pub use pose::{Pose, PoseError};
+pub use pose::{InvalidPose, Pose};
+pub use pose_error::PoseError;
 pub use reconciliation::{Discrepancy, Reconciliation, UnreceivedTopic};
 pub use stream::Stream;
 pub use topic::{Role, Topic, Verb};

@@ -10,7 +10,7 @@ const UNIT_TOLERANCE: f64 = 1e-4;
 
 /// Error of numbers from outside that are not a pose.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub enum PoseError {
+pub enum InvalidPose {
     /// A component is NaN, infinite or too large.
     #[error("pose component {0} is not a finite number within {MAX_ABS_M:e}")]
     NotFinite(f64),
@@ -57,21 +57,21 @@ impl Pose {
     /// Reads a row-major 4x4 matrix from outside.
     ///
     /// # Errors
-    /// [`PoseError`] when an entry is not finite, the last row is not `0 0 0 1` or the rotation is off orthonormal by
+    /// [`InvalidPose`] when an entry is not finite, the last row is not `0 0 0 1` or the rotation is off orthonormal by
     /// more than 1e-4.
-    pub fn from_matrix(matrix: &Matrix4<f64>) -> Result<Self, PoseError> {
+    pub fn from_matrix(matrix: &Matrix4<f64>) -> Result<Self, InvalidPose> {
         for &entry in matrix.iter() {
             check_bounded(entry)?;
         }
         let last: [f64; 4] = std::array::from_fn(|column| matrix[(3, column)]);
         if last != [0.0, 0.0, 0.0, 1.0] {
-            return Err(PoseError::LastRow(last));
+            return Err(InvalidPose::LastRow(last));
         }
         let rotation: Matrix3<f64> = matrix.fixed_view::<3, 3>(0, 0).into();
         let deviation = (rotation * rotation.transpose() - Matrix3::identity()).amax();
         let determinant = rotation.determinant();
         if deviation > UNIT_TOLERANCE || determinant < 0.0 {
-            return Err(PoseError::NotRotation { deviation, determinant });
+            return Err(InvalidPose::NotRotation { deviation, determinant });
         }
         let rotation = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(rotation));
         let translation = Translation3::new(matrix[(0, 3)], matrix[(1, 3)], matrix[(2, 3)]);
@@ -81,13 +81,13 @@ impl Pose {
     /// Checks a pose from outside.
     ///
     /// # Errors
-    /// [`PoseError`] when a number is not finite, beyond 10,000 km, or the quaternion is not of length one.
-    pub fn validate(&self) -> Result<(), PoseError> {
+    /// [`InvalidPose`] when a number is not finite, beyond 10,000 km, or the quaternion is not of length one.
+    pub fn validate(&self) -> Result<(), InvalidPose> {
         for &component in self.translation_m.iter().chain(&self.rotation_wxyz) {
             check_bounded(component)?;
         }
         let norm = self.rotation_wxyz.iter().map(|q| q * q).sum::<f64>().sqrt();
-        if (norm - 1.0).abs() > UNIT_TOLERANCE { Err(PoseError::NotUnit(norm)) } else { Ok(()) }
+        if (norm - 1.0).abs() > UNIT_TOLERANCE { Err(InvalidPose::NotUnit(norm)) } else { Ok(()) }
     }
 
     /// Heading: the angle from the target's x axis to the source's, seen from above, in radians.
@@ -126,8 +126,8 @@ impl From<Isometry3<f64>> for Pose {
     }
 }
 
-fn check_bounded(value: f64) -> Result<(), PoseError> {
-    if value.abs() <= MAX_ABS_M { Ok(()) } else { Err(PoseError::NotFinite(value)) }
+fn check_bounded(value: f64) -> Result<(), InvalidPose> {
+    if value.abs() <= MAX_ABS_M { Ok(()) } else { Err(InvalidPose::NotFinite(value)) }
 }
 
 #[cfg(test)]
@@ -189,10 +189,10 @@ mod tests {
             pose.validate()
         };
         for value in [f64::NAN, f64::INFINITY, 1e30] {
-            assert!(matches!(with(1, value), Err(PoseError::NotFinite(_))));
+            assert!(matches!(with(1, value), Err(InvalidPose::NotFinite(_))));
         }
-        assert!(matches!(with(3, 0.5), Err(PoseError::NotUnit(_))));
+        assert!(matches!(with(3, 0.5), Err(InvalidPose::NotUnit(_))));
         let mirror = Matrix4::from_diagonal(&[1.0, -1.0, 1.0, 1.0].into());
-        assert!(matches!(Pose::from_matrix(&mirror), Err(PoseError::NotRotation { .. })));
+        assert!(matches!(Pose::from_matrix(&mirror), Err(InvalidPose::NotRotation { .. })));
     }
 }

@@ -7,13 +7,12 @@
 //! - [`pose_source`]: origins of a vehicle's pose: recorded, noisy, estimated by one of the above.
 //! - [`tracker`]: the pose from sweep to sweep, with its covariance.
 //! - [`pose_covariance`]: covariance of the pose of one sweep.
-//! - [`pose_error`], [`statistics`]: measures of their accuracy.
+//! - [`statistics`]: measures of their accuracy.
 //!
 //! ```
-//! use localization::pose_error::PoseError;
 //! use localization::registration::kabsch::PairMoments;
 //! use nalgebra::Vector3;
-//! use protocol::Pose;
+//! use protocol::{Pose, PoseError};
 //!
 //! # fn main() -> Result<(), localization::registration::kabsch::Degenerate> {
 //! // Points of a sweep and the same points in the world, 2 m to the north.
@@ -36,7 +35,6 @@
 pub mod baselines;
 pub mod pgc;
 pub mod pose_covariance;
-pub mod pose_error;
 pub mod pose_source;
 pub mod registration;
 pub mod statistics;

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use deploy::operate::status::RunStatus;
-use deploy::run::report::RunReport;
+use deploy::report::RunReport;
 use support::output;
 
 use support::cli::BadInput;

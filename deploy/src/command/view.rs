@@ -1,15 +1,12 @@
 //! `v2vloc view`.
 
 use std::net::SocketAddr;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
-use std::time::{Duration, Instant};
 
 use bus::Endpoint;
-use bus::shutdown::Stop;
-use bus::web::WebServer;
 use deploy::operate::status::{Phase, RunStatus};
-use deploy::view::{LiveRun, RecordedRun, ViewError, serve_live, serve_recorded};
+use deploy::view::{LiveRun, serve_live, show_recorded, until_stopped};
 use protocol::RunId;
 use support::output;
 
@@ -48,7 +45,7 @@ impl Arguments {
     /// Serves the page until Ctrl-C.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
         match self.shown()? {
-            Shown::Recorded(path) => show(&path, self.listen)?,
+            Shown::Recorded(path) => show_recorded(&path, self.listen)?,
             Shown::Live(name, router) => {
                 // On the machine of the run, the run has priority.
                 let _ = rustix::process::nice(VIEWER_NICENESS);
@@ -59,30 +56,6 @@ impl Arguments {
         }
         Ok(Outcome::Done)
     }
-}
-
-/// Shows a recording until Ctrl-C.
-pub(super) fn show(recording: &Path, listen: SocketAddr) -> anyhow::Result<()> {
-    let run = RecordedRun::open(recording).map_err(|error| match error {
-        ViewError::NotRecorded(_) | ViewError::Empty(_) => anyhow::Error::from(BadInput::of(error)),
-        ViewError::Recording(_) => anyhow::Error::from(error),
-    })?;
-    output::note(format_args!("{} moments of run {}", run.len(), run.name()));
-    until_stopped(listen, |address| serve_recorded(address, Arc::new(run)))
-}
-
-/// Serves a page until Ctrl-C.
-fn until_stopped(
-    listen: SocketAddr,
-    serve: impl FnOnce(SocketAddr) -> std::io::Result<WebServer>,
-) -> anyhow::Result<()> {
-    let stop = Stop::new();
-    stop.on_signals()?;
-    let server = serve(listen).map_err(|error| BadInput::new(format!("cannot serve at {listen}: {error}")))?;
-    output::note(format_args!("http://{}/ (Ctrl-C ends it)", server.address()));
-    while !stop.wait_until(Instant::now() + Duration::from_secs(3600)) {}
-    warn_dropped(&server);
-    Ok(())
 }
 
 /// The run that is shown.
@@ -110,12 +83,5 @@ impl Arguments {
             // Without a status it may still hold a recording.
             _ => Ok(Shown::Recorded(folder)),
         }
-    }
-}
-
-fn warn_dropped(server: &WebServer) {
-    let dropped = server.readers().dropped();
-    if dropped > 0 {
-        output::note(format_args!("{dropped} readers did not read and were dropped"));
     }
 }

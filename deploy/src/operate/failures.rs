@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use sim_replay::recorder::RecordReport;
 
-use crate::operate::fleet::RECORDER;
+use crate::operate::RECORDER;
 use crate::operate::supervise::{ProcessEvent, ProcessEventKind};
 
 /// Failures of a run, by process.

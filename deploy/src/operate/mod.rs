@@ -1,17 +1,19 @@
 //! Operation of a fleet: its processes, network, keys, health and files.
 
-pub mod progress;
-mod run_error;
-pub use run_error::RunError;
-pub(crate) mod agent_pool;
 pub(crate) mod failures;
-pub mod fleet;
 pub mod health;
 pub mod keys;
 pub mod network;
+pub mod progress;
 pub mod remote_status;
 pub mod run_folder;
 pub mod security;
 pub mod status;
-pub(crate) mod status_reporter;
-pub(crate) mod supervise;
+pub mod status_reporter;
+pub mod supervise;
+pub mod timeouts;
+
+/// Name of the process that plays the scene.
+pub const REPLAY: &str = "replay";
+/// Name of the process that records all messages.
+pub const RECORDER: &str = "recorder";

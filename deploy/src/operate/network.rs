@@ -5,21 +5,52 @@ use std::time::Duration;
 
 use bus::shutdown::{self, Overdue};
 use bus::{BusError, BusOptions, Endpoint, SharedMemory, open, present, process_id};
+use protocol::{Principal, ProcessId, Role, RunId};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
 use zenoh::{Session, Wait};
 
-use protocol::{Principal, ProcessId, Role, RunId};
-
-use crate::operate::RunError;
 use crate::operate::security::RunKeys;
 use crate::operate::supervise::ProcessSpec;
-use crate::scenario::Network;
 use crate::score::scorer_cav;
 
 /// Longest time for closing the session.
 const CLOSE_LIMIT: Duration = Duration::from_millis(500);
 
+/// Network of the processes.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct Network {
+    /// Address at which the router inside this run listens; port 0 takes any free one.
+    pub listen: String,
+    /// Router that runs already (`zenohd`), for example `tcp/10.0.0.1:7447`; no router is started then.
+    pub connect: Option<String>,
+    /// Pool of shared memory of each process for its large messages to others of the same machine, MiB; 0: everything
+    /// takes the socket. A router elsewhere has to be attached (`v2vloc router --shared-memory`).
+    pub shared_memory_mib: usize,
+    /// Longest time for handing one map or sweep to one receiver on another host, seconds, after which the router
+    /// inside this run closes that connection. A receiver behind a slow link needs more (8 MiB at 13 Mbit/s take 5 s).
+    /// Other receivers do not wait for it.
+    pub stall_limit_s: f64,
+    /// Address at which the scorer serves its counters to Prometheus; the other processes take the ports after it, in
+    /// the order in which they are started. Not served when absent.
+    pub metrics: Option<SocketAddr>,
+}
+
+impl Default for Network {
+    fn default() -> Self {
+        Self {
+            listen: "tcp/127.0.0.1:0".into(),
+            connect: None,
+            shared_memory_mib: 0,
+            stall_limit_s: 5.0,
+            metrics: None,
+        }
+    }
+}
+
 /// An open session, and the endpoint that the other processes connect to.
-pub(crate) struct RouterEndpoint {
+pub struct RouterEndpoint {
     /// The session of this process.
     pub session: Session,
     /// Endpoint that the other processes are given.
@@ -33,7 +64,7 @@ impl RouterEndpoint {
     ///
     /// # Errors
     /// [`BusError`] when the port is in use, no router answers, the endpoint is invalid or the keys do not fit.
-    pub(crate) fn open(network: &Network, run: &RunId, keys: Option<&RunKeys>) -> Result<Self, BusError> {
+    pub fn open(network: &Network, run: &RunId, keys: Option<&RunKeys>) -> Result<Self, BusError> {
         let options = match &network.connect {
             Some(router) => {
                 let options = BusOptions::client(Endpoint::new(router)?);
@@ -54,29 +85,25 @@ impl RouterEndpoint {
         Ok(Self { session, endpoint: from_here(options.endpoint())?, is_guarded: options.guard.is_some() })
     }
 
-    /// Checks that none of the processes to start, nor a scorer, is already present on a shared router.
+    /// Processes to start, and a scorer, that are present already on a shared router.
     ///
     /// # Errors
-    /// [`RunError::Live`] names those present; [`RunError::Network`] when the router does not answer.
-    pub(crate) fn check_free(&self, network: &Network, run: &RunId, specs: &[ProcessSpec]) -> Result<(), RunError> {
+    /// [`BusError`] when the router does not answer.
+    pub fn present(&self, network: &Network, run: &RunId, specs: &[ProcessSpec]) -> Result<Vec<ProcessId>, BusError> {
         if network.connect.is_none() {
-            return Ok(());
+            return Ok(Vec::new());
         }
         let scorer = process_id(Role::Scorer, &scorer_cav());
         let is_ours =
             |process: &ProcessId| *process == scorer || specs.iter().any(|spec| spec.name == process.as_str());
-        let processes: Vec<ProcessId> = present(&self.session, run)?.into_iter().filter(is_ours).collect();
-        if processes.is_empty() {
-            return Ok(());
-        }
-        Err(RunError::Live { run: run.clone(), router: self.endpoint.to_string(), processes })
+        Ok(present(&self.session, run)?.into_iter().filter(is_ours).collect())
     }
 
     /// Closes the session.
     ///
     /// # Errors
     /// [`Overdue`] when the session does not close in time.
-    pub(crate) fn close(self) -> Result<(), Overdue> {
+    pub fn close(self) -> Result<(), Overdue> {
         shutdown::within(CLOSE_LIMIT, "the router", move || {
             if let Err(cause) = self.session.close().wait() {
                 tracing::debug!("closing the router: {cause}");

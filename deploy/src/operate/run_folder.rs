@@ -28,11 +28,11 @@ pub enum RunFolderError {
 }
 
 /// The recording of a run.
-pub(crate) const RECORDING: &str = "recording.mcap";
+pub const RECORDING: &str = "recording.mcap";
 /// Arrival times of the sweeps at the ego's agent.
-pub(crate) const SWEEP_LOG: &str = "sweeps.csv";
+pub const SWEEP_LOG: &str = "sweeps.csv";
 /// Checkpoint of the replay, from which a restarted one resumes.
-pub(crate) const CHECKPOINT: &str = "replay.json";
+pub const CHECKPOINT: &str = "replay.json";
 
 /// The folder of one run.
 #[derive(Debug, Clone)]
@@ -101,7 +101,7 @@ impl RunFolder {
     ///
     /// # Errors
     /// [`RunFolderError::Write`].
-    pub(crate) fn write_config(&self, process: &str, config: &impl Serialize) -> Result<PathBuf, RunFolderError> {
+    pub fn write_config(&self, process: &str, config: &impl Serialize) -> Result<PathBuf, RunFolderError> {
         let name = format!("config/{process}.yaml");
         let path = self.file(&name);
         let unwritable = |source| RunFolderError::Write { path: path.clone(), source };
@@ -134,7 +134,7 @@ impl RunFolder {
 
 /// The table of ticks: a header line, then a line per tick, answered or not. With the scenario of each tick, that is the
 /// first column.
-pub(crate) fn frames_csv(records: &[FrameRecord], swept: &BTreeMap<u64, u64>, scenarios: Option<&[String]>) -> String {
+pub fn frames_csv(records: &[FrameRecord], swept: &BTreeMap<u64, u64>, scenarios: Option<&[String]>) -> String {
     let header = "tick,agent_frame,capture_nanos,latency_ms,detected,truth,found,fused,skipped,oldest_ms,stale,payload_bytes,wire_bytes,ego_error_m,\
          ego_error_deg,swept_ms,posed_ms,published_ms,arrived_ms,decided_ms,fused_ms,detected_ms,answered,tick_unix_nanos,\
          streamed_tick,streamed_age_ms,streamed_detected,streamed_found";

@@ -9,13 +9,23 @@ use std::time::{Duration, Instant};
 use bus::shutdown::Stop;
 use bus::{AccessControl, BusError, BusOptions, Credentials, ROUTER, Rejection, RejectionLog};
 use protocol::{Principal, RunId, RunScope};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
 
 use crate::operate::keys::{self, KeyError, KeyPlan};
 use crate::operate::network::RouterEndpoint;
-use crate::scenario::Security;
 
 /// Lifetime of the keys of one run, days.
 const DAYS_OF_A_RUN: u32 = 30;
+
+/// QUIC between all processes; each is restricted to its own topics.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct Security {
+    /// Folder that `v2vloc keys` has written, relative to the scenario file; absent: keys are generated for this run
+    /// only.
+    pub keys: Option<PathBuf>,
+}
 
 /// Folder with the keys of every process of a run.
 #[derive(Debug)]
@@ -41,7 +51,7 @@ impl RunKeys {
 
     /// The folder of one process.
     #[must_use]
-    pub(crate) fn of_process(&self, name: &str) -> PathBuf {
+    pub fn of_process(&self, name: &str) -> PathBuf {
         self.folder.join(name)
     }
 
@@ -84,7 +94,7 @@ impl Drop for RunKeys {
 const LOOK_ROUND: Duration = Duration::from_secs(1);
 
 /// Reads the refusals of a run's router.
-pub(crate) struct RefusalWatch {
+pub struct RefusalWatch {
     stop: Stop,
     thread: Option<JoinHandle<RejectionLog>>,
 }
@@ -94,7 +104,7 @@ impl RefusalWatch {
     ///
     /// # Errors
     /// [`BusError::Thread`] when the system gives no thread.
-    pub(crate) fn over(place: &RouterEndpoint) -> Result<Self, BusError> {
+    pub fn over(place: &RouterEndpoint) -> Result<Self, BusError> {
         let stop = Stop::new();
         if !place.is_guarded {
             return Ok(Self { stop, thread: None });
@@ -116,7 +126,7 @@ impl RefusalWatch {
     }
 
     /// All refusals, which are also logged.
-    pub(crate) fn finish(mut self) -> BTreeMap<Rejection, u64> {
+    pub fn finish(mut self) -> BTreeMap<Rejection, u64> {
         self.stop.request();
         let counts =
             self.thread.take().and_then(|thread| thread.join().ok()).map_or_else(BTreeMap::new, |all| all.counts());

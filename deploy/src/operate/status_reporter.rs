@@ -7,38 +7,45 @@ use bus::Endpoint;
 use bus::shutdown::Stop;
 use protocol::RunId;
 
+use crate::operate::REPLAY;
 use crate::operate::failures::Failures;
-use crate::operate::fleet::{Fleet, REPLAY};
 use crate::operate::health::Health;
 use crate::operate::progress::Display;
 use crate::operate::run_folder::RunFolder;
 use crate::operate::status::{Phase, StatusWriter};
 use crate::operate::supervise::{ProcessEvent, ProcessEventKind, Supervisor};
+use crate::operate::timeouts::Timeouts;
 use crate::score::{Progress, ScorerNode};
 
 /// Update interval of the display and of the checks.
 const BEAT: Duration = Duration::from_millis(100);
 
 /// Reason for the end of a run.
-pub(crate) enum Ending {
+pub enum Ending {
     /// The scene is over.
     Over,
     /// The user ended the run.
     Asked,
     /// A process crashed and is not restarted.
-    Failed { process: String, how: String },
+    Failed {
+        /// Name of the process.
+        process: String,
+        /// Description of its end.
+        how: String,
+    },
 }
 
 /// Supervision of a run.
-pub(crate) struct StatusReporter {
+pub struct StatusReporter {
     health: Health,
     failures: Failures,
     status: StatusWriter,
 }
 
 impl StatusReporter {
-    pub(crate) fn new(fleet: &Fleet, run: &RunId, endpoint: &Endpoint, folder: &RunFolder) -> Self {
-        let timeouts = &fleet.scenario.timeouts;
+    /// For a run with these timeouts and its router at `endpoint`.
+    #[must_use]
+    pub fn new(timeouts: &Timeouts, run: &RunId, endpoint: &Endpoint, folder: &RunFolder) -> Self {
         let [hang, start] = [timeouts.hang_s, timeouts.ready_s.max(timeouts.hang_s)].map(Duration::from_secs_f64);
         Self {
             health: Health::new(hang, start),
@@ -48,7 +55,7 @@ impl StatusReporter {
     }
 
     /// Records an event; returns the failure of the process from now on, as text.
-    pub(crate) fn note(&mut self, event: &ProcessEvent) -> Option<String> {
+    pub fn note(&mut self, event: &ProcessEvent) -> Option<String> {
         self.health.note(event, Instant::now());
         let failure = self.failures.note(event)?;
         self.health.fails(&event.name, failure);
@@ -56,25 +63,25 @@ impl StatusReporter {
     }
 
     /// Failures that the run continued without, as text.
-    pub(crate) fn failures(&self) -> Vec<String> {
+    pub fn failures(&self) -> Vec<String> {
         self.failures.in_words()
     }
 
     /// Processes that crashed at least once.
-    pub(crate) fn fallen(&self) -> Vec<String> {
+    pub fn fallen(&self) -> Vec<String> {
         let statuses = self.health.statuses(Instant::now()).into_iter();
         statuses.filter(|process| process.last_fall.is_some()).map(|process| process.name).collect()
     }
 
     /// Writes the status of the run.
-    pub(crate) fn tell(&mut self, phase: Phase, progress: &Progress) {
+    pub fn tell(&mut self, phase: Phase, progress: &Progress) {
         let health = &self.health;
         self.status.write(phase, progress, |now| health.statuses(now));
     }
 
     /// Displays events and replaces hung processes until the scene is over, the user ends the run, or a process stays
     /// down.
-    pub(crate) fn follow(
+    pub fn follow(
         &mut self,
         supervisor: &Supervisor,
         happened: &Receiver<ProcessEvent>,

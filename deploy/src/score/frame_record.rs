@@ -97,7 +97,7 @@ impl FrameRecord {
 
 /// A result and its ground truth, for pictures.
 #[derive(Debug, Clone)]
-pub(crate) struct JudgedFrame {
+pub struct JudgedFrame {
     /// Tick of the scene, counted from 0.
     pub tick: u64,
     /// Result of the ego.

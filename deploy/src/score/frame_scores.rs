@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use dataset::average_precision::{Ordering, Scorer};
 use dataset::ground_truth::GroundTruthRule;
-use protocol::{Box3d, CavId, Detections, DropReason, Pose, PoseEstimate, Stamp, Truth};
+use protocol::{Box3d, CavId, Detections, DropReason, Pose, PoseError, PoseEstimate, Stamp, Truth};
 
 use super::frame_record::{FrameRecord, JudgedFrame, StreamedResult};
 use super::live_precision::{Answer, LivePrecision, TickTruth};
@@ -14,7 +14,7 @@ use super::precision::{by_iou, found_by_last, precision_recall_csv};
 use super::stage_stamps::StageStamps;
 use super::true_boxes::true_boxes;
 use super::truth_line::TruthLine;
-use crate::score::metrics::{ByIou, Communication, Latencies, Percentiles, PoseError, PoseErrors};
+use crate::score::metrics::{ByIou, Communication, Latencies, Percentiles, PoseErrors};
 
 /// Gap between two frames beyond which they belong to two scenarios, nanoseconds.
 const SCENARIO_GAP_NANOS: u64 = 10_000_000_000;
@@ -59,7 +59,7 @@ impl FrameScores {
     }
 
     /// Continues with the results of another vehicle: in another scenario.
-    pub(crate) fn change_ego(&mut self, ego: &CavId) {
+    pub fn change_ego(&mut self, ego: &CavId) {
         self.ego.clone_from(ego);
         self.live.forget();
     }
@@ -121,7 +121,7 @@ impl FrameScores {
 
     /// Frame for the picture so far: the one with the most neighbours, then true boxes.
     #[must_use]
-    pub(crate) fn showpiece(&self) -> Option<&JudgedFrame> {
+    pub fn showpiece(&self) -> Option<&JudgedFrame> {
         self.best.as_ref()
     }
 
@@ -134,7 +134,7 @@ impl FrameScores {
     /// Precision over recall at the three IoU thresholds as a table, a row per detection by falling score; precision is
     /// made non-increasing in recall, as for [`Self::average_precision`].
     #[must_use]
-    pub(crate) fn precision_recall_csv(&self) -> String {
+    pub fn precision_recall_csv(&self) -> String {
         precision_recall_csv(&self.scorer)
     }
 
@@ -230,7 +230,7 @@ impl FrameScores {
 
     /// Scores a frame whose truth is known already, at once; `poses` are the estimates of all vehicles. The same frame
     /// must not be given to [`Self::truth`], [`Self::result`] and [`Self::pose`].
-    pub(crate) fn judge_whole(
+    pub fn judge_whole(
         &mut self,
         (tick, capture_nanos): (u64, u64),
         latency_ms: Option<f64>,

@@ -3,8 +3,7 @@
 use std::collections::VecDeque;
 
 use dataset::average_precision::{Ordering, Scorer};
-use perception::boxes::postprocess::is_within;
-use protocol::{Box3d, Detection, Pose};
+use protocol::{Box3d, Detection, Pose, corners_within};
 
 use super::frame_record::StreamedResult;
 use super::precision::{by_iou, found_by_last};
@@ -122,7 +121,7 @@ impl LivePrecision {
             let box3d = found.box3d.transformed(&now_from_then);
             Detection { box3d, ..found.clone() }
         });
-        let within = moved.filter(|found| is_within(&found.box3d.corners(), truth.area_m)).collect();
+        let within = moved.filter(|found| corners_within(&found.box3d.corners(), truth.area_m)).collect();
         let age_ms = (truth.began_nanos.saturating_sub(*began_nanos)) as f64 * 1e-6;
         Some((StreamedResult { tick: *tick, age_ms, detected: 0, found: 0 }, within))
     }

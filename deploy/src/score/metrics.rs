@@ -6,8 +6,7 @@ use std::collections::BTreeMap;
 
 use dataset::LeftOut;
 use dataset::evaluation_protocol::EvaluationProtocol;
-pub use localization::pose_error::PoseError;
-use protocol::{CavId, Counts, DropReason, Ledger};
+use protocol::{CavId, Counts, DropReason, Ledger, PoseError};
 use serde::{Deserialize, Serialize};
 use support::statistics::{quantile, sorted};
 
@@ -19,7 +18,7 @@ pub use contribution::Contribution;
 const SUCCESS_M: f64 = 3.0;
 
 /// Metrics of one run.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct Metrics {
     /// Number of frames that the ego reported.
     pub frames: u64,
@@ -82,7 +81,7 @@ pub struct Metrics {
 impl Metrics {
     /// Metrics from the scores of a run of `seconds`; `sent_bytes` is the size of all messages that neighbours sent, if
     /// known.
-    pub(crate) fn of(
+    pub fn of(
         board: &FrameScores,
         clock: &str,
         [method, pose_source]: [&str; 2],
@@ -217,7 +216,7 @@ impl Messages {
     /// True if most of the messages that were sent neither arrived nor were lost: then the link carries next to
     /// nothing.
     #[must_use]
-    pub(crate) fn are_stuck(&self) -> bool {
+    pub fn are_stuck(&self) -> bool {
         self.in_flight >= FEW && self.in_flight > self.sent / 2
     }
 }
@@ -273,20 +272,7 @@ pub(crate) mod tests {
             clock: "wall".into(),
             method: method.into(),
             pose_source: "recorded".into(),
-            ap_global: ByIou::default(),
-            ap_frame_order: ByIou::default(),
-            ap_answered: ByIou::default(),
-            ap_unanswered_empty: ByIou::default(),
-            ap_streaming: None,
-            pose: PoseErrors::default(),
-            latency_ms: Latencies::default(),
-            age_ms: Percentiles::default(),
-            comm: Communication::default(),
-            contribution: Contribution::default(),
-            neighbours: BTreeMap::new(),
-            messages: Messages::default(),
-            protocol: None,
-            left_out: LeftOut::default(),
+            ..Metrics::default()
         }
     }
 

@@ -117,7 +117,7 @@ pub enum ScorerError {
 }
 
 /// A running scorer.
-pub(crate) struct ScorerNode {
+pub struct ScorerNode {
     bus: Bus,
     inbox: Arc<Inbox>,
     progress: Arc<Mutex<Progress>>,
@@ -133,7 +133,7 @@ impl ScorerNode {
     ///
     /// # Errors
     /// [`ScorerError`] when the bus, the file or the system refuses.
-    pub(crate) fn start(
+    pub fn start(
         session: Session,
         run: &RunId,
         agents: &[CavId],
@@ -181,20 +181,20 @@ impl ScorerNode {
     ///
     /// # Errors
     /// [`ScorerError::Bus`] when the address cannot be listened at.
-    pub(crate) fn serve_metrics(&mut self, address: SocketAddr, others: Vec<MetricsPeer>) -> Result<(), ScorerError> {
+    pub fn serve_metrics(&mut self, address: SocketAddr, others: Vec<MetricsPeer>) -> Result<(), ScorerError> {
         self.bus.serve_metrics(address, others)?;
         Ok(())
     }
 
     /// Progress so far.
     #[must_use]
-    pub(crate) fn progress(&self) -> Progress {
+    pub fn progress(&self) -> Progress {
         self.progress.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
     /// Processes that were offline so far.
     #[must_use]
-    pub(crate) fn absent(&self) -> BTreeSet<String> {
+    pub fn absent(&self) -> BTreeSet<String> {
         self.offline.so_far()
     }
 
@@ -203,7 +203,7 @@ impl ScorerNode {
     /// # Panics
     /// When the scorer's own thread has panicked.
     #[must_use]
-    pub(crate) fn finish(self) -> Scored {
+    pub fn finish(self) -> Scored {
         self.inbox.close();
         let (board, stats, unwritten) = self.thread.join().expect("the scorer's thread has no reason to panic");
         let own_stats = self.bus.stats();
@@ -233,7 +233,7 @@ impl ScorerNode {
 /// # Panics
 /// Never: the name is an identifier.
 #[must_use]
-pub(crate) fn scorer_cav() -> CavId {
+pub fn scorer_cav() -> CavId {
     CavId::new(SCORER).expect("six lower-case letters")
 }
 

@@ -65,7 +65,7 @@ impl OfflineIntervals {
 
 /// True if a process that the account concerns was offline: sender, receiver or the link between them.
 #[must_use]
-pub(crate) fn concerns(offline: &BTreeSet<String>, account: &Account) -> bool {
+pub fn concerns(offline: &BTreeSet<String>, account: &Account) -> bool {
     let replay = Role::Replay.to_string();
     let agent = |cav| process_id(Role::Agent, cav).to_string();
     let mut concerned: Vec<String> = match &account.topic {

@@ -9,10 +9,10 @@ mod images;
 mod judgement;
 mod live;
 mod pace_counter;
-pub mod picture;
 mod recorded;
 mod scene_frame;
 mod server;
+mod show;
 #[cfg(test)]
 mod tests;
 
@@ -22,3 +22,4 @@ pub use pace_counter::ShownPace;
 pub use recorded::{RecordedRun, ViewError};
 pub use scene_frame::SceneFrame;
 pub use server::{serve_live, serve_recorded};
+pub use show::{show_recorded, until_stopped};

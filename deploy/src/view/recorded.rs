@@ -106,7 +106,7 @@ impl RecordedRun {
                 Topic::Control(_) | Topic::Ready(_) | Topic::Alive { .. } => {}
             }
         }
-        let swept = agent::sweep_log::read(&file.with_file_name(SWEEP_LOG)).unwrap_or_default();
+        let swept = support::sweep_log::read(&file.with_file_name(SWEEP_LOG)).unwrap_or_default();
         let (pace, mut judge) = (PaceCounter::default(), Judge::default());
         let assembly = Mutex::new(FrameAssembler::with_areas(areas.clone()));
         let mut run = Self { recording, name, moments: Vec::new(), swept, stats, pace, assembly };
@@ -261,7 +261,7 @@ impl RecordedRun {
 
 fn ego_error_m(pose: &PoseEstimate, truth: &Truth, result: &Detections) -> Option<f64> {
     let agent = truth.agents.iter().find(|agent| agent.cav == result.ego)?;
-    Some(localization::pose_error::PoseError::between(pose.world_from_cav()?, &agent.world_from_lidar).distance_m)
+    Some(protocol::PoseError::between(pose.world_from_cav()?, &agent.world_from_lidar).distance_m)
 }
 
 fn is_result(topic: &Topic) -> bool {

@@ -119,7 +119,7 @@ fn record(folder: &Path) -> RecordedRun {
         }
     }
     writer.finish().unwrap();
-    let mut sweeps = agent::sweep_log::SweepLog::open(&folder.join(crate::operate::run_folder::SWEEP_LOG)).unwrap();
+    let mut sweeps = support::sweep_log::SweepLog::open(&folder.join(crate::operate::run_folder::SWEEP_LOG)).unwrap();
     (0..TICKS).for_each(|tick| sweeps.note(100_000_000 * (tick + 1), 1_000_000_000 * tick + 3_000_000).unwrap());
     RecordedRun::open(folder).unwrap()
 }

@@ -8,27 +8,47 @@ use std::process;
 use clap::{Arg, ArgAction, Command, Parser};
 use clap_complete::Shell;
 
+use crate::command_tree::CommandTree;
 use crate::output::{self, Verbosity};
+use crate::sibling_program::Sibling;
 
 /// Variable that asks for a completion script (`bash`, `zsh`, `fish`, ...) on standard output, or for manual pages in a
 /// folder (`man:FOLDER`), instead of running.
-const GENERATE: &str = "V2VLOC_GENERATE";
+pub(crate) const GENERATE: &str = "V2VLOC_GENERATE";
+/// Value of the variable that asks for the subcommands and their options as JSON: what a program asks its sibling for.
+pub(crate) const DESCRIPTION: &str = "description";
 
 /// Parses the command line of this process; sets the verbosity of its messages. Ends the process on wrong usage, as
 /// [`Parser::parse`].
 #[must_use]
 pub fn parse<P: Parser>() -> P {
-    let command = with_verbosity(P::command());
+    parse_with(None)
+}
+
+/// The same with the subcommands that a program beside this one carries out: where one of these is given, the process
+/// becomes that program.
+#[must_use]
+pub fn parse_beside<P: Parser>(sibling: &Sibling) -> P {
+    parse_with(Some(sibling))
+}
+
+fn parse_with<P: Parser>(sibling: Option<&Sibling>) -> P {
     if let Some(wanted) = env::var_os(GENERATE) {
         let wanted = wanted.to_string_lossy();
-        let generated = generate(command, &wanted);
+        let generated = generate(P::command(), sibling, &wanted);
         if let Err(error) = &generated {
             output::error(format_args!("{GENERATE}={wanted}: {error}"));
         }
         process::exit(if generated.is_ok() { 0 } else { 2 });
     }
-    let matches = command.get_matches();
+    let end = |error: io::Error| -> ! {
+        output::error(error);
+        process::exit(1)
+    };
+    sibling.and_then(|sibling| sibling.exec_help(env::args_os())).map(end);
+    let matches = with_verbosity(sibling.map_or_else(P::command, |sibling| sibling.extend(P::command()))).get_matches();
     output::set_verbosity(verbosity(matches.get_count("verbose"), matches.get_flag("quiet")));
+    sibling.and_then(|sibling| sibling.exec_subcommand(&matches)).map(end);
     P::from_arg_matches(&matches).unwrap_or_else(|error| error.exit())
 }
 
@@ -50,7 +70,11 @@ fn verbosity(verbose: u8, quiet: bool) -> Verbosity {
     }
 }
 
-fn generate(mut command: Command, wanted: &str) -> io::Result<()> {
+fn generate(command: Command, sibling: Option<&Sibling>, wanted: &str) -> io::Result<()> {
+    if wanted == DESCRIPTION {
+        return output::line(serde_json::to_string(&CommandTree::of(&command))?);
+    }
+    let mut command = with_verbosity(sibling.map_or_else(|| command.clone(), |sibling| complete(&command, sibling)));
     if let Some(folder) = wanted.strip_prefix("man:") {
         return clap_mangen::generate_to(command, Path::new(folder));
     }
@@ -59,6 +83,14 @@ fn generate(mut command: Command, wanted: &str) -> io::Result<()> {
     let mut script = Vec::new();
     clap_complete::generate(shell, &mut command, name, &mut script);
     output::text(String::from_utf8_lossy(&script))
+}
+
+/// The command with the subcommands of a sibling; without their options where the sibling is not installed.
+fn complete(command: &Command, sibling: &Sibling) -> Command {
+    sibling.extend_described(command.clone()).unwrap_or_else(|error| {
+        output::note(format_args!("without the options of {}: {error}", sibling.program));
+        sibling.extend(command.clone())
+    })
 }
 
 #[cfg(test)]
@@ -103,10 +135,10 @@ mod tests {
     #[test]
     fn manual_pages_are_written_and_an_unknown_shell_is_named() {
         let folder = tempfile::tempdir().unwrap();
-        generate(with_verbosity(Cli::command()), &format!("man:{}", folder.path().display())).unwrap();
+        generate(Cli::command(), None, &format!("man:{}", folder.path().display())).unwrap();
         let mut pages: Vec<_> = folder.path().read_dir().unwrap().map(|page| page.unwrap().file_name()).collect();
         pages.sort();
         assert!(pages.contains(&"program.1".into()) && pages.contains(&"program-act.1".into()), "{pages:?}");
-        assert!(generate(Cli::command(), "tcsh").is_err());
+        assert!(generate(Cli::command(), None, "tcsh").is_err());
     }
 }

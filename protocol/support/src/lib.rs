@@ -6,6 +6,7 @@
 //! - [`bounded_file`], [`atomic_file`], [`csv_file`]: reads with a limit on their size, atomic writes, CSV.
 //! - [`statistics`], [`stage_times`], [`nanos`]: quantiles and correlations, the stopwatch, durations in nanoseconds.
 //! - [`rounding`]: floats to integers.
+//! - [`sweep_log`]: arrival of each sweep at an agent, for whoever times a run.
 //! - [`random`]: seeds derived from seeds, and draws that depend on the seed only.
 //!
 //! ```
@@ -25,6 +26,7 @@ pub mod atomic_file;
 pub mod bounded_file;
 pub mod cli;
 pub mod command_line;
+mod command_tree;
 pub mod csv_file;
 pub mod nanos;
 pub mod output;
@@ -35,4 +37,5 @@ pub mod shared_files;
 pub mod sibling_program;
 pub mod stage_times;
 pub mod statistics;
+pub mod sweep_log;
 pub mod text_table;

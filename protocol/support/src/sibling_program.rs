@@ -1,38 +1,129 @@
-//! Sibling programs: a subcommand that another program of the same folder executes.
+//! Sibling program: subcommands that another program of the same folder carries out.
 //!
-//! A vehicle carries the program of its process only. Training and evaluation are in a program of their own, with the
-//! readers of data sets, and are called by the same name, as Git and Cargo do it.
+//! A program links what its own subcommands need. Others, which need more, are in a program of their own and are called
+//! by the same name, as Git and Cargo do it.
 
 use std::env;
 use std::ffi::OsString;
 use std::io;
 use std::os::unix::process::CommandExt;
-use std::process::Command;
+use std::path::PathBuf;
+use std::process;
 
+use clap::{Arg, ArgAction, ArgMatches, Command};
+
+use crate::command_line::{DESCRIPTION, GENERATE};
+use crate::command_tree::CommandTree;
 use crate::output::{Verbosity, verbosity};
 
-/// Arguments of a subcommand that a sibling program executes, `--help` included.
-#[derive(Debug, clap::Args)]
-#[command(disable_help_flag = true)]
-pub struct Forwarded {
-    /// Arguments as they were given.
-    #[arg(trailing_var_arg = true, allow_hyphen_values = true, hide = true)]
-    arguments: Vec<OsString>,
+/// Argument of the subcommands: everything behind their name, `--help` included.
+const REST: &str = "forwarded";
+
+/// A program beside this one, and the subcommands that it carries out.
+#[derive(Debug, Clone, Copy)]
+pub struct Sibling {
+    /// File name of the program.
+    pub program: &'static str,
+    /// Name and purpose of each subcommand.
+    pub subcommands: &'static [(&'static str, &'static str)],
 }
 
-impl Forwarded {
-    /// Replaces this process by `program`, from the same folder or else from `PATH`. Returns only on failure.
-    #[must_use]
-    pub fn exec(&self, program: &str, subcommand: &str) -> io::Error {
-        let beside = env::current_exe().ok().map(|own| own.with_file_name(program)).filter(|path| path.exists());
-        let path = beside.unwrap_or_else(|| program.into());
+impl Sibling {
+    /// Adds the subcommands to `command`. Their options are known to the program only.
+    pub(crate) fn extend(&self, command: Command) -> Command {
+        let rest =
+            || Arg::new(REST).action(ArgAction::Append).value_parser(clap::value_parser!(OsString)).num_args(0..);
+        let rest = || rest().trailing_var_arg(true).allow_hyphen_values(true).hide(true);
+        let stub = |(name, about): &(&'static str, &'static str)| {
+            Command::new(*name).about(*about).disable_help_flag(true).arg(rest())
+        };
+        command.subcommands(self.subcommands.iter().map(stub))
+    }
+
+    /// Adds the subcommands to `command` with their options, as the program describes them.
+    ///
+    /// # Errors
+    /// The system's if the program cannot be executed; also when it does not describe its subcommands.
+    pub(crate) fn extend_described(&self, command: Command) -> io::Result<Command> {
+        let output = process::Command::new(self.path()).env(GENERATE, DESCRIPTION).output()?;
+        let described: CommandTree = serde_json::from_slice(&output.stdout)?;
+        let subcommand = |(name, _): &(&'static str, &'static str)| {
+            let known = described.subcommands.iter().find(|known| known.name == *name);
+            known.map(CommandTree::command).ok_or_else(|| io::Error::other(format!("it has no subcommand {name}")))
+        };
+        let subcommands = self.subcommands.iter().map(subcommand).collect::<io::Result<Vec<_>>>()?;
+        Ok(command.subcommands(subcommands))
+    }
+
+    /// Replaces this process by the program if the arguments ask for the help of one of the subcommands. Returns only
+    /// otherwise or on failure.
+    pub(crate) fn exec_help(&self, mut arguments: impl Iterator<Item = OsString>) -> Option<io::Error> {
+        let [_, help] = [arguments.next()?, arguments.next()?];
+        let rest: Vec<OsString> = arguments.collect();
+        let name = rest.first()?.to_str().filter(|name| help == "help" && self.has(name))?;
+        Some(self.exec(name, [&help].into_iter().chain(&rest)))
+    }
+
+    /// Replaces this process by the program if the command line names one of the subcommands. Returns only otherwise
+    /// or on failure.
+    pub(crate) fn exec_subcommand(&self, matches: &ArgMatches) -> Option<io::Error> {
+        let (name, matches) = matches.subcommand().filter(|(name, _)| self.has(name))?;
+        let rest = matches.get_many::<OsString>(REST).into_iter().flatten();
+        Some(self.exec(name, [&OsString::from(name)].into_iter().chain(rest)))
+    }
+
+    fn has(&self, name: &str) -> bool {
+        self.subcommands.iter().any(|(known, _)| *known == name)
+    }
+
+    fn exec<'a>(&self, name: &str, arguments: impl Iterator<Item = &'a OsString>) -> io::Error {
         let verbosity: &[&str] = match verbosity() {
             Verbosity::Quiet => &["--quiet"],
             Verbosity::Usual => &[],
             Verbosity::Debug => &["-v"],
             Verbosity::Trace => &["-vv"],
         };
-        let error = Command::new(&path).args(verbosity).arg(subcommand).args(&self.arguments).exec();
-        io::Error::new(error.kind(), format!("{subcommand} is part of the program {}: {error}", path.display()))
+        let path = self.path();
+        let error = process::Command::new(&path).args(verbosity).args(arguments).exec();
+        io::Error::new(error.kind(), format!("{name} is part of the program {}: {error}", path.display()))
+    }
+
+    /// The program of the same folder, or else the one in `PATH`.
+    fn path(&self) -> PathBuf {
+        let beside = env::current_exe().ok().map(|own| own.with_file_name(self.program));
+        beside.filter(|path| path.exists()).unwrap_or_else(|| self.program.into())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SIBLING: Sibling =
+        Sibling { program: "/no/program", subcommands: &[("train", "Train"), ("eval", "Evaluate")] };
+
+    fn failure(line: &str) -> Option<String> {
+        let words = || line.split(' ').map(OsString::from);
+        let help = SIBLING.exec_help(words());
+        let command = || SIBLING.extend(Command::new("program").subcommand(Command::new("run")));
+        let error = help.or_else(|| SIBLING.exec_subcommand(&command().get_matches_from(words())));
+        error.map(|error| error.to_string())
+    }
+
+    #[test]
+    fn a_program_that_is_missing_is_named() {
+        for line in ["program train --fast -v x", "program train --help", "program help train"] {
+            let message = failure(line).unwrap();
+            assert!(message.starts_with("train is part of the program /no/program: "), "{line}: {message}");
+        }
+        assert_eq!(failure("program run"), None);
+    }
+
+    #[test]
+    fn everything_behind_the_name_is_passed_on() {
+        let matches =
+            SIBLING.extend(Command::new("program")).get_matches_from(["program", "eval", "--a=1", "-h", "--", "b"]);
+        let rest: Vec<_> = matches.subcommand().unwrap().1.get_many::<OsString>(REST).unwrap().collect();
+        assert_eq!(rest, ["--a=1", "-h", "--", "b"]);
     }
 }

@@ -4,7 +4,7 @@
 use std::collections::HashMap;
 use std::path::Path;
 
-use protocol::{EgoMotion, Handedness, Pose, PoseError};
+use protocol::{EgoMotion, Handedness, InvalidPose, Pose};
 
 use super::yaml::{Field, Value};
 use super::{Problem, ReadError, classes};
@@ -82,7 +82,7 @@ impl<'a> Annotations<'a> {
     pub(super) fn objects(
         &mut self,
         id: impl Fn(i64, &Field<'a>) -> Result<i64, ReadError>,
-        pose: impl Fn(&CarlaPose) -> Result<Pose, PoseError>,
+        pose: impl Fn(&CarlaPose) -> Result<Pose, InvalidPose>,
     ) -> Vec<Object> {
         let entries = self.object_entries().unwrap_or_else(|error| {
             self.left_out("list of objects", error);
@@ -109,7 +109,7 @@ impl<'a> Annotations<'a> {
         key: &str,
         field: &Field<'a>,
         id: &impl Fn(i64, &Field<'a>) -> Result<i64, ReadError>,
-        pose: &impl Fn(&CarlaPose) -> Result<Pose, PoseError>,
+        pose: &impl Fn(&CarlaPose) -> Result<Pose, InvalidPose>,
     ) -> Result<Object, ReadError> {
         let listed_id = listed_id(key, field)?;
         Ok(Object {

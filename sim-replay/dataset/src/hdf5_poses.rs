@@ -72,7 +72,7 @@ fn parse(
 }
 
 #[expect(clippy::indexing_slicing, reason = "three lines of four columns are twelve numbers")]
-fn pose(row: &[f64; 12], order: RowOrder) -> Result<Pose, protocol::PoseError> {
+fn pose(row: &[f64; 12], order: RowOrder) -> Result<Pose, protocol::InvalidPose> {
     let mut matrix = Matrix4::identity();
     for line in 0..3 {
         for column in 0..4 {

@@ -5,7 +5,7 @@
 
 use std::path::PathBuf;
 
-use protocol::{CavId, EgoMotion, Handedness, Pose, PoseError};
+use protocol::{CavId, EgoMotion, Handedness, InvalidPose, Pose};
 
 use super::agent_folders::ScenarioFolder;
 use super::annotations::Annotations;
@@ -102,7 +102,7 @@ impl Opv2v {
         }
     }
 
-    fn world_from(&self, place: &CarlaPose) -> Result<Pose, PoseError> {
+    fn world_from(&self, place: &CarlaPose) -> Result<Pose, InvalidPose> {
         match self.handedness {
             Handedness::Left => {
                 let pose = place.to_pose();

@@ -1,8 +1,9 @@
-//! Command line: messages and exit codes of wrong input, closed outputs, options in service files, poses of single clouds,
+//! Command line: messages and exit codes of wrong input, closed outputs, sibling programs, options in service files, poses of single clouds,
 //! fusion methods from files.
 
 mod closed_output;
 mod evaluation;
 mod locate;
+mod programs;
 mod scenario_errors;
 mod services;

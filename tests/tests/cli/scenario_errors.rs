@@ -101,9 +101,10 @@ fn a_port_in_use_is_named() {
 fn a_missing_program_is_named() {
     let folder = tempfile::tempdir().unwrap();
     let scenario = write_scenario(folder.path(), 1, "", "");
-    let lonely = folder.path().join("v2vloc");
-    fs::copy(programs().join("v2vloc"), &lonely).unwrap();
-    let (code, stderr) = up(&lonely, folder.path(), &scenario);
+    for name in ["v2vloc", "v2vloc-runner"] {
+        fs::copy(programs().join(name), folder.path().join(name)).unwrap();
+    }
+    let (code, stderr) = up(&folder.path().join("v2vloc"), folder.path(), &scenario);
     assert_eq!(code, Some(1), "{stderr}");
     assert!(
         stderr.contains(&folder.path().join("agent").display().to_string()) && stderr.contains("is missing"),

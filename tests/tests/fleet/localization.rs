@@ -5,7 +5,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use deploy::scenario::Scenario;
+use runner::scenario::Scenario;
 use serde_json::Value;
 use tests::fleet::{Up, programs, results, write_scenario};
 use tests::locks::exclusive_lock;

@@ -3,9 +3,9 @@
 use std::fs;
 use std::time::{Duration, Instant};
 
-use deploy::scenario::Scenario;
 use protocol::{Stream, Topic};
 use recording::Recording;
+use runner::scenario::Scenario;
 use serde_json::Value;
 use tests::fleet::{TIMEOUT, Up, fused, is_running, results, signal, write_scenario};
 use tests::locks::exclusive_lock;

@@ -5,14 +5,14 @@ use std::ops::ControlFlow;
 use std::path::Path;
 use std::process::{Command, Output};
 
-use deploy::run::run_fleet::{RunOptions, RunResult, run_scenario};
-use deploy::scenario::Scenario;
 use ego_fuser::pairing::PairingConfig;
 use ego_fuser_offline::evaluation::stepped::{AgentPool, ComputeTimes, SteppedConfig};
 use ego_fuser_offline::evaluation::{EvaluateConfig, EvaluatedFrame, Evaluator};
 use fusion::Method;
 use link::{ClockStep, DelayModel, DeviceClock, LinkConfig, LossModel};
 use protocol::{CodecConfig, DropReason, Dtype};
+use runner::run::run_fleet::{RunOptions, RunResult, run_scenario};
+use runner::scenario::Scenario;
 use serde_json::Value;
 use tests::fleet::{programs, results, write_scenario, write_sighted_weights};
 use tests::locks::exclusive_lock;

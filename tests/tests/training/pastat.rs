@@ -10,7 +10,6 @@ use ::training::feature_store::{FeatureStore, KeptMaps, MapSource, is_encoder};
 use ::training::samples::{Moments, SamplePoses};
 use ::training::train::{self, TrainConfig};
 use dataset::{self, IntensityScale, LoadOptions, Scenario};
-use deploy::experiment::table::{self, TableObserver, TableSpec};
 use ego_fuser_offline::evaluation::{EvaluateConfig, EvaluatedFrame, Evaluator};
 use fusion::Method;
 use fusion::pastat::{Part, ablated};
@@ -18,6 +17,7 @@ use localization::pose_source::{CachedPoseConfig, NoiseMode, NoisyPoseConfig, Po
 use perception::inference::Inference;
 use perception::weights::Weights;
 use protocol::{CodecConfig, Dtype, NoPoseReason, PoseEstimate};
+use runner::experiment::table::{self, TableObserver, TableSpec};
 use tests::locks::random_generator_lock;
 use tests::scene;
 use tests::training::{Ear, config, small};

@@ -8,7 +8,7 @@ use std::time::Instant;
 
 use dataset::frame::Frame;
 use dataset::{self, LeftOut, LoadOptions, Problem, ReadError, Scenario};
-use protocol::{CavId, Pose, PoseEstimate};
+use protocol::{CavId, Pose, PoseError, PoseEstimate};
 
 pub use summary::{CalibrationBin, IntegritySummary, LocalizationSummary, RejectionSummary, reliability_charts};
 pub use table::{write_csv, write_error_table};
@@ -16,7 +16,6 @@ pub use table::{write_csv, write_error_table};
 use localization::pgc::LocalizerError;
 use localization::pgc::confidence::{Confidence, Labelled};
 use localization::pgc::{Localization, Localize, LocalizerTimes};
-use localization::pose_error::PoseError;
 use localization::pose_source::{PoseInput, PoseSource};
 
 /// Selection of sweeps.

@@ -11,7 +11,7 @@ use localization::pgc::SceneHead;
 use localization::pgc::pose_refinement::SweepCells;
 use localization::pgc::pose_search::{PoseSearch, SearchTimes};
 use localization::pgc::pose_solver::PoseSolver;
-use localization::pose_error::PoseError;
+use protocol::PoseError;
 
 /// Errors on sweeps that were not trained on.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]

@@ -2,7 +2,7 @@
 
 use nalgebra::{Isometry3, Point3};
 use protocol::rotated_iou::Polygon;
-use protocol::{Box3d, CavId, Detection};
+use protocol::{Box3d, CavId, Detection, corners_within};
 use serde::{Deserialize, Serialize};
 
 use crate::boxes::decode::Decoded;
@@ -89,7 +89,7 @@ pub fn postprocess(agents: &[AgentBoxes<'_>], config: &PostprocessConfig) -> Vec
         agents.iter().enumerate().flat_map(|(agent, boxes)| project(agent, boxes)).collect();
     candidates.retain(|candidate| is_vehicle_sized(&candidate.corners, config));
     let mut kept = suppress(&candidates, config);
-    kept.retain(|candidate| is_within(&candidate.corners, config.keep_range_m));
+    kept.retain(|candidate| corners_within(&candidate.corners, config.keep_range_m));
     kept
 }
 
@@ -119,13 +119,6 @@ pub fn suppress(candidates: &[Candidate], config: &PostprocessConfig) -> Vec<Can
     let scores: Vec<f32> = candidates.iter().map(|candidate| candidate.score).collect();
     let kept = rotated_nms(&polygons, &scores, config.nms_iou, config.nms_max_candidates);
     kept.into_iter().map(|index| candidates[index].clone()).collect()
-}
-
-/// True if all corners lie within x, y of the lower and the upper corner of `range_m`, edges included.
-#[must_use]
-pub fn is_within(corners: &[[f64; 3]; 8], range_m: [f64; 4]) -> bool {
-    let [x_low, y_low, x_high, y_high] = range_m;
-    corners.iter().all(|&[x, y, _]| (x_low..=x_high).contains(&x) && (y_low..=y_high).contains(&y))
 }
 
 /// The upright box of eight corners.

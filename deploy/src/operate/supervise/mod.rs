@@ -49,7 +49,7 @@ pub enum RestartPolicy {
 
 /// Event of a process.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct ProcessEvent {
+pub struct ProcessEvent {
     /// Name of the process.
     pub name: String,
     /// Kind of the event.
@@ -58,7 +58,7 @@ pub(crate) struct ProcessEvent {
 
 /// Kind of an event.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) enum ProcessEventKind {
+pub enum ProcessEventKind {
     /// The process runs.
     Started {
         /// Its process id.
@@ -118,13 +118,13 @@ pub enum SuperviseError {
 
 /// Result of ending a fleet.
 #[derive(Debug, Default, Clone, PartialEq, Eq)]
-pub(crate) struct StopReport {
+pub struct StopReport {
     /// Processes that did not end in time and were killed.
     pub killed: Vec<String>,
 }
 
 /// Processes of a run. Dropping it kills those that still run.
-pub(crate) struct Supervisor {
+pub struct Supervisor {
     runtime: Runtime,
     watched: Vec<Watched>,
 }
@@ -145,7 +145,7 @@ impl Supervisor {
     ///
     /// # Errors
     /// [`SuperviseError`] before anything is started.
-    pub(crate) fn start(
+    pub fn start(
         specs: Vec<ProcessSpec>,
         log_dir: &Path,
         restarts: u32,
@@ -188,12 +188,12 @@ impl Supervisor {
 
     /// True if every process has ended for good.
     #[must_use]
-    pub(crate) fn all_ended(&self) -> bool {
+    pub fn all_ended(&self) -> bool {
         self.watched.iter().all(|watched| watched.task.is_finished())
     }
 
     /// Kills a hung process; then the rules of a crash apply. `why` describes the problem.
-    pub(crate) fn replace(&self, name: &str, why: &str) {
+    pub fn replace(&self, name: &str, why: &str) {
         if let Some(watched) = self.watched.iter().find(|watched| watched.name == name) {
             // Full: it is being replaced already.
             let _ = watched.replace.try_send(why.to_owned());
@@ -202,7 +202,7 @@ impl Supervisor {
 
     /// Ends the processes that `which` selects by name: SIGTERM, then SIGKILL at `deadline`. Returns when they have
     /// ended.
-    pub(crate) fn end(&mut self, which: impl Fn(&str) -> bool, deadline: Instant) -> StopReport {
+    pub fn end(&mut self, which: impl Fn(&str) -> bool, deadline: Instant) -> StopReport {
         let (chosen, others) = self.watched.drain(..).partition(|watched| which(&watched.name));
         self.watched = others;
         let chosen: Vec<Watched> = chosen;
@@ -219,7 +219,7 @@ impl Supervisor {
     }
 
     /// Ends all processes within `grace`.
-    pub(crate) fn stop(mut self, grace: Duration) -> StopReport {
+    pub fn stop(mut self, grace: Duration) -> StopReport {
         self.end(|_| true, Instant::now() + grace)
     }
 }

@@ -4,8 +4,7 @@ use std::sync::Arc;
 
 use dataset::average_precision::{Ordering, Scorer};
 use fusion::model::CooperativeModel;
-use perception::boxes::postprocess::is_within;
-use protocol::Box3d;
+use protocol::{Box3d, corners_within};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use tch::no_grad;
@@ -74,7 +73,7 @@ impl Validator {
             // The ground truth has the same limits as the detections.
             let inside = |object: &&Box3d| {
                 let corners = object.corners();
-                is_within(&corners, limits.keep_range_m)
+                corners_within(&corners, limits.keep_range_m)
                     && corners.iter().all(|corner| (limits.z_range_m[0]..=limits.z_range_m[1]).contains(&corner[2]))
             };
             let objects: Vec<_> = sample.objects.iter().filter(inside).copied().collect();

@@ -1,0 +1,265 @@
+//! `v2vloc eval`.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use agent::attack::{AttackConfig, Falsification};
+use agent::config::Threads;
+use agent::rate::RateConfig;
+use clap::ArgGroup;
+use dataset::IntensityScale;
+use dataset::evaluation_protocol::ProtocolConfig;
+use ego_fuser::config::EgoSettings;
+use ego_fuser::misbehaviour::MisbehaviourConfig;
+use ego_fuser_offline::evaluation::stepped::{AgentPool, ComputeTimes, SteppedConfig};
+use fusion::Method;
+use indicatif::ProgressBar;
+use link::{CapacityConfig, DelayModel, LinkConfig};
+use localization::pose_source::PoseSourceConfig;
+use perception::int8::InferencePrecision;
+use protocol::CodecConfig;
+use protocol::config::{FieldError, Section};
+use runner::experiment::evaluation::{EvaluationOptions, Part, evaluate, frame_count};
+use runner::experiment::report;
+use runner::experiment::table::{self, TableObserver, TableSpec};
+use support::output;
+use support::progress;
+use training::feature_store::KeptMaps;
+
+use super::left_out;
+use support::cli::BadInput;
+use support::cli::Outcome;
+
+#[derive(Debug, clap::Args)]
+#[command(group = ArgGroup::new("emulation").args(["link", "bandwidth", "latency"]).multiple(true))]
+pub(crate) struct Arguments {
+    /// Data set, split or scenario; its layout is detected. The first vehicle of each scenario is the ego.
+    #[arg(long, value_name = "DIR", required_unless_present = "table")]
+    dataset: Option<PathBuf>,
+    /// Fusion methods, as `ego-fuser methods` lists them; several give one table.
+    #[arg(long, value_name = "NAME", num_args = 1.., value_delimiter = ',', required_unless_present = "table")]
+    method: Vec<Method>,
+    /// Weights of the detector; or a folder with *-METHOD.safetensors or METHOD/weights.safetensors for each method; or
+    /// the folder of a training.
+    #[arg(long, value_name = "FILE", required_unless_present = "table")]
+    weights: Option<PathBuf>,
+    /// Number format in which networks are computed.
+    #[arg(long, value_enum, default_value_t, conflicts_with = "table")]
+    precision: InferencePrecision,
+    /// Instead: a file of tables, rows of methods and columns of conditions; cells that are done are kept in --out.
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["dataset", "method", "weights"], requires = "out")]
+    table: Option<PathBuf>,
+    /// Folder for detections.jsonl, truth.jsonl, frames.csv and precision_recall.csv of each method; with --table, of the
+    /// tables [default: nothing is written].
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+    #[command(flatten, next_help_heading = "Pose")]
+    pose: Section<PoseSourceConfig>,
+    #[command(flatten)]
+    codec: Section<CodecConfig>,
+    #[command(flatten)]
+    rate: Section<RateConfig>,
+    /// Delay of the messages of neighbours, milliseconds.
+    #[arg(long, value_name = "MS", default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=10_000))]
+    delay: u64,
+    /// Link emulation between neighbours and ego, in simulation time: a preset of `sim-replay link`, or a file.
+    #[arg(long, value_name = "PRESET|FILE", conflicts_with = "delay")]
+    link: Option<String>,
+    /// Rate of the link, Mbit/s; replaces that of --link.
+    #[arg(long, value_name = "MBPS", conflicts_with = "delay")]
+    bandwidth: Option<f64>,
+    /// Delay of the link after the last bit, milliseconds; replaces that of --link.
+    #[arg(long, value_name = "MS", conflicts_with = "delay")]
+    latency: Option<f64>,
+    /// Same seed, same losses and delays (--link).
+    #[arg(long, default_value_t = 0, requires = "emulation")]
+    seed: u64,
+    /// Longest time that a frame waits for its neighbours, milliseconds (--link) [default: that of ego-fuser run].
+    #[arg(long, value_name = "MS", requires = "emulation")]
+    deadline_ms: Option<u64>,
+    /// Largest age of a feature map that is still fused, by capture time, milliseconds (--link) [default: that of
+    /// ego-fuser run].
+    #[arg(long, value_name = "MS", requires = "emulation")]
+    max_age_ms: Option<u64>,
+    /// Compute time of pose, map and fusion, milliseconds, for example 20,60,30; without it no latency is reported
+    /// (--link).
+    #[arg(long, value_name = "MS,MS,MS", value_delimiter = ',', num_args = 1, default_values_t = [0.0; 3], requires = "emulation")]
+    compute: Vec<f64>,
+    /// Attack by neighbours: falsified messages, to measure their effect on the ego.
+    #[arg(long, value_enum, value_name = "ATTACK")]
+    attack: Option<Falsification>,
+    /// Number of attackers, the first neighbours of every scenario (--attack).
+    #[arg(long, default_value_t = 1, requires = "attack")]
+    attackers: usize,
+    /// Seed of the falsified messages (--attack).
+    #[arg(long, default_value_t = 0, requires = "attack")]
+    attack_seed: u64,
+    /// Misbehaviour detection: excludes neighbours whose messages contradict the ego's own detections.
+    #[arg(long)]
+    trust: bool,
+    /// Keep the feature maps of the encoder in this folder, so that each is computed once for many evaluations.
+    #[arg(long, value_name = "DIR")]
+    maps: Option<PathBuf>,
+    /// Largest number of frames to evaluate, over all scenarios [default: all].
+    #[arg(long, value_parser = clap::value_parser!(u64).range(1..))]
+    frames: Option<u64>,
+    /// Largest number of scenarios to evaluate, evenly spread [default: all].
+    #[arg(long, value_parser = clap::value_parser!(u64).range(1..))]
+    scenarios: Option<u64>,
+    /// Number that stored intensities are divided by [default: auto; `sim-replay inspect --help` describes the rule].
+    #[arg(long, value_name = "auto|1|255|NUMBER", default_value_t, hide_default_value = true)]
+    intensity_scale: IntensityScale,
+    /// Number of compute threads, 1 to 256 [default: 1].
+    #[arg(long)]
+    threads: Option<Threads>,
+    #[command(flatten)]
+    protocol: ProtocolConfig,
+    /// Print JSON in the shape of metrics.json (a list of them for several methods) instead of a table.
+    #[arg(long)]
+    json: bool,
+}
+
+fn at_most(count: u64) -> usize {
+    usize::try_from(count).unwrap_or(usize::MAX)
+}
+
+impl Arguments {
+    /// Evaluates every method and prints the metrics.
+    pub(crate) fn run(self) -> anyhow::Result<Outcome> {
+        let threads = self.threads.unwrap_or_default();
+        threads.validate().map_err(bad)?;
+        threads.apply();
+        if let (Some(spec), Some(out)) = (&self.table, &self.out) {
+            return tables(spec, out);
+        }
+        let options = self.options()?;
+        let bar = progress::bar(self.method.len() * frame_count(&options)?, "frames");
+        let mut all = Vec::new();
+        for &method in &self.method {
+            bar.set_message(method.name());
+            all.push(evaluate(&options, method, &mut || bar.inc(1))?);
+        }
+        bar.finish_and_clear();
+        match (self.json, &all[..]) {
+            (true, [one]) => output::line(serde_json::to_string_pretty(one)?)?,
+            (true, several) => output::line(serde_json::to_string_pretty(several)?)?,
+            (false, several) => {
+                output::text(report::table(several))?;
+                if let Some(protocol) = several.iter().find_map(|metrics| metrics.protocol.as_ref()) {
+                    output::line(protocol)?;
+                }
+            }
+        }
+        if let Some((metrics, dataset)) = all.first().zip(self.dataset.as_deref()) {
+            report::print_unlocated(metrics, &self.pose.0, dataset);
+        }
+        Ok(left_out(all.iter().map(|metrics| &metrics.left_out)))
+    }
+
+    fn options(&self) -> Result<EvaluationOptions, BadInput> {
+        self.pose.0.validate().map_err(bad)?;
+        if self.rate.0.watch_queue && !self.emulates_link() {
+            return Err(BadInput::new("--watch-queue: without --link there is no queue to watch"));
+        }
+        let codec = self.codec.0;
+        Ok(EvaluationOptions {
+            // Required without a table.
+            dataset: self.dataset.clone().unwrap_or_default(),
+            weights: self.weights.clone().unwrap_or_default(),
+            precision: self.precision,
+            pose_source: self.pose.0.clone(),
+            codec,
+            rate: self.rate.0,
+            delay_nanos: self.delay * 1_000_000,
+            attack: self.attack.map(|falsification| AttackConfig {
+                falsification,
+                attackers: self.attackers,
+                seed: self.attack_seed,
+            }),
+            trust: self.trust.then(MisbehaviourConfig::default),
+            maps: self.maps.as_ref().map(|folder| KeptMaps {
+                folder: folder.clone(),
+                dtype: codec.dtype,
+                limit_bytes: u64::MAX,
+                intensity_scale: self.intensity_scale,
+            }),
+            frames: self.frames.map(at_most),
+            stepped: self.emulates_link().then(|| self.stepped()).transpose()?,
+            part: Part { scenarios: self.scenarios.map(at_most), ticks: None, intensity_scale: self.intensity_scale },
+            protocol: self.protocol.clone(),
+            out: self.out.clone(),
+        })
+    }
+
+    fn emulates_link(&self) -> bool {
+        self.link.is_some() || self.bandwidth.is_some() || self.latency.is_some()
+    }
+
+    fn stepped(&self) -> Result<SteppedConfig, BadInput> {
+        let (mut link, link_folder) =
+            LinkConfig::open(self.link.as_deref().unwrap_or("ideal")).map_err(BadInput::of)?;
+        if let Some(rate_mbps) = self.bandwidth {
+            link.capacity = CapacityConfig::TokenBucket { rate_mbps, burst_bytes: 0 };
+        }
+        if let Some(latency_ms) = self.latency {
+            link.delay = DelayModel::ConstantMs(latency_ms);
+        }
+        link.validate().map_err(BadInput::of)?;
+        let &[pose_ms, map_ms, fuse_ms] = &self.compute[..] else {
+            return Err(BadInput::new(format!("--compute takes 3 numbers, not {}", self.compute.len())));
+        };
+        if let Some(ms) = self.compute.iter().find(|ms| !(0.0..=60_000.0).contains(*ms)) {
+            return Err(BadInput::new(format!("--compute: {ms} is not 0 to 60000 ms")));
+        }
+        let defaults = EgoSettings::default();
+        let ego = EgoSettings {
+            deadline_ms: self.deadline_ms.unwrap_or(defaults.deadline_ms),
+            max_age_ms: self.max_age_ms.unwrap_or(defaults.max_age_ms),
+            ..defaults
+        };
+        ego.validate().map_err(bad)?;
+        Ok(SteppedConfig {
+            link,
+            link_folder,
+            seed: self.seed,
+            deadline_nanos: ego.deadline_ms.saturating_mul(1_000_000),
+            pairing: ego.pairing(),
+            compute: ComputeTimes { pose_ms, map_ms, fuse_ms },
+            crew: AgentPool::First(usize::MAX),
+            vehicles: BTreeMap::new(),
+            ticks: 0..usize::MAX,
+            lidar_variant: None,
+        })
+    }
+}
+
+fn bad(error: FieldError) -> BadInput {
+    BadInput::new(error.to_string())
+}
+
+/// Fills tables and prints them.
+fn tables(spec: &Path, out: &Path) -> anyhow::Result<Outcome> {
+    let mut progress = TableProgress(progress::spinner("frames"));
+    let filled = table::run(&TableSpec::read(spec)?, out, &mut progress)?;
+    progress.0.finish_and_clear();
+    filled.iter().try_for_each(|table| output::line(table::markdown(table)))?;
+    let cells = filled.iter().flat_map(|table| &table.rows).flat_map(|row| row.cells.iter().flatten());
+    Ok(left_out(cells.map(|cell| &cell.metrics.left_out)))
+}
+
+/// Shows on standard error which cell is computed.
+struct TableProgress(ProgressBar);
+
+impl TableObserver for TableProgress {
+    fn cell(&mut self, table: &str, row: &str, column: &str, known: bool) {
+        let text = format!("{table}: {row}, {column}{}", if known { ", known" } else { "" });
+        if self.0.is_hidden() {
+            output::note(&text);
+        }
+        self.0.set_message(text);
+    }
+
+    fn frame(&mut self) {
+        self.0.tick();
+    }
+}

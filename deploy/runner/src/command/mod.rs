@@ -1,0 +1,88 @@
+//! One file per subcommand: its arguments, and the call into the library.
+
+mod capacity;
+mod demo;
+mod eval;
+mod schema;
+mod sweep;
+mod up;
+
+use std::error::Error;
+use std::path::PathBuf;
+
+use anyhow::Context;
+use bus::{BusError, malloc_settings};
+use dataset::LeftOut;
+use runner::experiment::evaluation::EvaluationError;
+use runner::experiment::sweep::SweepError;
+use runner::experiment::table::TableError;
+use runner::fleet::FleetError;
+use runner::run::RunError;
+use runner::scenario::ScenarioError;
+use support::cli::Outcome;
+use support::output;
+
+/// Subcommands of `v2vloc` that compute networks.
+#[derive(Debug, clap::Subcommand)]
+pub(crate) enum Command {
+    /// Estimate the pace of a run, in a process of its own.
+    #[command(hide = true)]
+    Capacity(capacity::Arguments),
+    /// Generate a scene if there is none, run a fleet on it and print the result.
+    Demo(Box<demo::Arguments>),
+    /// Start a fleet: processes, scene, models, network; Ctrl-C ends it.
+    Up(Box<up::Arguments>),
+    /// Evaluate methods on recorded scenes without a network: AP, pose errors, bytes.
+    Eval(Box<eval::Arguments>),
+    /// Run a grid of experiments in simulation time: one CSV, charts, a report.
+    Sweep(sweep::Arguments),
+    /// Print the JSON schema of a kind of file, for editors: the files in deploy/scenarios and deploy/experiments are
+    /// its output.
+    Schema(schema::Arguments),
+}
+
+impl Command {
+    /// Runs the subcommand.
+    pub(crate) fn run(self) -> anyhow::Result<Outcome> {
+        let settings = [malloc_settings::KEPT_MEMORY.as_slice(), &[malloc_settings::ROUTER_THREADS]].concat();
+        malloc_settings::ensure(&settings).context("this program again")?;
+        match self {
+            Self::Capacity(arguments) => arguments.run(),
+            Self::Demo(arguments) => arguments.run(),
+            Self::Up(arguments) => arguments.run(),
+            Self::Eval(arguments) => arguments.run(),
+            Self::Sweep(arguments) => arguments.run(),
+            Self::Schema(arguments) => arguments.run(),
+        }
+    }
+}
+
+/// Prints what evaluations left out, each finding once, and the counts of the first incomplete one.
+fn left_out<'a>(all: impl Iterator<Item = &'a LeftOut>) -> Outcome {
+    let mut sum = LeftOut::default();
+    let mut first = None;
+    for one in all.filter(|one| **one != LeftOut::default()) {
+        sum.merge(one);
+        first.get_or_insert(one);
+    }
+    let outcome = sum.print();
+    first.into_iter().for_each(output::note);
+    outcome
+}
+
+/// True if the cause of an error is a fault of usage or input, and not of the program.
+pub(crate) fn is_bad_input(cause: &(dyn Error + 'static)) -> bool {
+    cause.is::<ScenarioError>()
+        || cause.is::<FleetError>()
+        || cause.is::<EvaluationError>()
+        || cause.is::<TableError>()
+        || BusError::is_behind(cause)
+        || cause.downcast_ref::<SweepError>().is_some_and(SweepError::is_bad_input)
+        || cause.downcast_ref::<RunError>().is_some_and(RunError::is_bad_input)
+}
+
+/// Folder of the programs: they are built and installed together.
+pub(crate) fn programs() -> anyhow::Result<PathBuf> {
+    let own = std::env::current_exe().context("folder of this program")?;
+    Ok(own.parent().context("this program is in no folder")?.to_path_buf())
+}

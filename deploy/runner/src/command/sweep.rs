@@ -1,0 +1,50 @@
+//! `v2vloc sweep`.
+
+use std::path::PathBuf;
+
+use runner::experiment::sweep::{Experiment, Sweep, SweepOptions};
+use support::output;
+
+use super::left_out;
+use support::cli::Outcome;
+
+#[derive(Debug, clap::Args)]
+pub(crate) struct Arguments {
+    /// The experiment; deploy/experiments holds ready ones.
+    experiment: PathBuf,
+    /// Folder of the results; runs that it holds already are not repeated [default: sweeps/NAME].
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+    /// Number of compute processes, each with one thread. The results do not depend on it.
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=256))]
+    jobs: u16,
+    /// Only print the number of runs and the time that they will take.
+    #[arg(long)]
+    dry_run: bool,
+    /// Compute the runs whose numbers come on standard input, for another sweep.
+    #[arg(long, hide = true)]
+    worker: bool,
+}
+
+impl Arguments {
+    /// Runs the experiment and prints its table.
+    pub(crate) fn run(self) -> anyhow::Result<Outcome> {
+        tch::set_num_threads(1);
+        let out = match self.out {
+            Some(out) => out,
+            None => PathBuf::from("sweeps").join(Experiment::read(&self.experiment)?.name),
+        };
+        let sweep = Sweep::open(&self.experiment, &out)?;
+        if self.worker {
+            sweep.work()?;
+            return Ok(Outcome::Done);
+        }
+        let options = SweepOptions { out: out.clone(), jobs: usize::from(self.jobs), dry_run: self.dry_run };
+        let swept = sweep.run(&options)?;
+        output::text(&swept.table)?;
+        if !self.dry_run {
+            output::note(format_args!("report {}", out.join("report.html").display()));
+        }
+        Ok(left_out(swept.left_out.iter()))
+    }
+}

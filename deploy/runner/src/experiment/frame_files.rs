@@ -1,0 +1,70 @@
+//! Frame files of an evaluation: detections, ground truth, a row per frame, and precision over recall.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::io;
+use std::path::{Path, PathBuf};
+
+use deploy::operate::run_folder::frames_csv;
+use deploy::score::FrameScores;
+use ego_fuser_offline::evaluation::EvaluatedFrame;
+use fusion::Method;
+
+use crate::frame_lines::FrameLines;
+
+/// Files of one method in a folder of its own: `detections.jsonl`, `truth.jsonl`, `frames.csv` and
+/// `precision_recall.csv`. The first two are those of a run, with the name of the scenario.
+pub(crate) struct FrameFiles {
+    folder: PathBuf,
+    lines: FrameLines,
+    /// Scenario of each frame so far.
+    scenarios: Vec<String>,
+}
+
+/// Files that cannot be written.
+#[derive(Debug, thiserror::Error)]
+#[error("{}: {source}", folder.display())]
+pub struct FrameFilesError {
+    folder: PathBuf,
+    source: io::Error,
+}
+
+impl FrameFiles {
+    /// Empty files of a method in a folder of `out`.
+    ///
+    /// # Errors
+    /// [`FrameFilesError`] when there are such files already, or they cannot be written.
+    pub(crate) fn create(out: &Path, method: Method) -> Result<Self, FrameFilesError> {
+        let folder = out.join(file_name(method));
+        let failed = |source| FrameFilesError { folder: folder.clone(), source };
+        fs::create_dir_all(out).and_then(|()| fs::create_dir(&folder)).map_err(failed)?;
+        let lines = FrameLines::create(&folder).map_err(failed)?;
+        Ok(Self { folder, lines, scenarios: Vec::new() })
+    }
+
+    /// Adds a frame of a scenario; false after an error, which [`Self::finish`] returns.
+    pub(crate) fn add(&mut self, scenario: &str, frame: &EvaluatedFrame) -> bool {
+        self.scenarios.push(scenario.to_owned());
+        self.lines.add(Some(scenario), frame)
+    }
+
+    /// Writes the rest, with the scores of the same frames.
+    ///
+    /// # Errors
+    /// [`FrameFilesError`] with the first error of the operating system.
+    pub(crate) fn finish(self, board: &FrameScores) -> Result<(), FrameFilesError> {
+        let Self { folder, lines, scenarios } = self;
+        let write = || {
+            lines.finish()?;
+            fs::write(folder.join("frames.csv"), frames_csv(board.records(), &BTreeMap::new(), Some(&scenarios)))?;
+            fs::write(folder.join("precision_recall.csv"), board.precision_recall_csv())
+        };
+        write().map_err(|source| FrameFilesError { folder: folder.clone(), source })
+    }
+}
+
+/// Name of a method as a name of files.
+fn file_name(method: Method) -> String {
+    let is_plain = |letter: char| letter.is_ascii_alphanumeric() || "._-".contains(letter);
+    method.name().chars().map(|letter| if is_plain(letter) { letter } else { '-' }).collect()
+}

@@ -1,0 +1,219 @@
+//! Fleet of a scenario: its vehicles, its processes, and the configuration of each.
+
+mod error;
+mod processes;
+mod routes;
+
+use std::path::{Path, PathBuf};
+
+use agent::config::Publish;
+use dataset::evaluation_protocol::{EvaluationProtocol, ProtocolConfig};
+use dataset::ground_truth::GroundTruthRule;
+use dataset::{self, OpenOptions};
+use deploy::operate::keys::KeyError;
+use deploy::operate::run_folder::RunFolder;
+use deploy::operate::security::RunKeys;
+use fusion::Exchange;
+use fusion::Method;
+use link::LinkEmulator;
+use localization::baselines::load_baseline;
+use localization::pgc::pose_solver::PoseSolver;
+use localization::pgc::{Localizer, LocalizerError};
+use localization::pose_source::{PgcConfig, PoseSourceConfig, TrackedPoseConfig};
+use perception::inference::Inference;
+use perception::model_config::DetectorConfig;
+use perception::weights::Weights;
+use protocol::{CavId, Principal, Role};
+use sim_replay::config::SceneConfig;
+use tch::Device;
+
+pub use self::error::FleetError;
+pub use self::processes::SessionContext;
+use crate::scenario::Scenario;
+use crate::scenario::weights_choice::weights_of;
+
+/// The program that runs fleets.
+pub(crate) const RUNNER: &str = "v2vloc-runner";
+
+/// A scenario in which every open setting is filled in.
+#[derive(Debug, Clone)]
+pub struct Fleet {
+    /// The scenario, with scene and vehicles named.
+    pub scenario: Scenario,
+    /// Every vehicle that takes part, in the scene's order.
+    pub agents: Vec<CavId>,
+    /// The fusing vehicle.
+    pub ego: CavId,
+    /// Number of ticks to play; `None`: until the run is ended.
+    pub ticks: Option<usize>,
+    /// Folder of the recorded scenario, for its hash.
+    pub scene_dir: PathBuf,
+    /// Configuration of the model, from its weights.
+    pub detector: DetectorConfig,
+    /// Evaluation protocol of the run.
+    pub protocol: EvaluationProtocol,
+}
+
+/// Refuses options of a protocol that a live run takes from other fields.
+fn chosen_elsewhere(protocol: &ProtocolConfig) -> Result<(), FleetError> {
+    let options = [
+        ("agents", protocol.agents.is_some()),
+        ("ego", protocol.ego.is_some()),
+        ("max_agents", protocol.max_agents.is_some()),
+    ];
+    match options.iter().find(|(_, is_given)| *is_given) {
+        Some((option, _)) => Err(FleetError::Protocol(format!("{option}: choose by scene.agents and ego.id instead"))),
+        None => Ok(()),
+    }
+}
+
+impl Fleet {
+    /// Reads scene and weights.
+    ///
+    /// # Errors
+    /// [`FleetError`] names what the scene or the weights lack.
+    pub fn plan(scenario: &Scenario) -> Result<Self, FleetError> {
+        let mut scenario = scenario.clone();
+        scenario.models.weights = weights_of(&scenario.models.weights, scenario.method)?;
+        let detector = Weights::load(&scenario.models.weights)?.config()?;
+        scenario.poses().iter().try_for_each(load_networks)?;
+        if let Some(link) = &scenario.link {
+            LinkEmulator::open(&link.model, link.seed)?;
+        }
+        let scene = &mut scenario.scene;
+        let dataset = dataset::open_with(&scene.dir, &open_options(scene))?;
+        chosen_elsewhere(&scenario.protocol)?;
+        let protocol = scenario.protocol.resolve(dataset.layout).map_err(FleetError::Protocol)?;
+        let recorded = match &scene.scenario {
+            None => dataset.scenarios.first().ok_or_else(|| FleetError::Empty(scene.dir.clone()))?,
+            Some(name) => {
+                dataset.scenarios.iter().find(|known| known.name == *name).ok_or_else(|| FleetError::NoScenario {
+                    dir: scene.dir.clone(),
+                    asked: name.clone(),
+                    found: dataset.scenarios.iter().map(|known| known.name.clone()).collect(),
+                })?
+            }
+        };
+        let name = recorded.name.clone();
+        if recorded.ticks.is_empty() {
+            let agents = recorded.agents.iter().map(ToString::to_string).collect();
+            return Err(FleetError::NoFrames { dir: scene.dir.clone(), name, agents });
+        }
+        if scene.seek >= recorded.ticks.len() {
+            return Err(FleetError::Seek { seek: scene.seek, name, ticks: recorded.ticks.len() });
+        }
+        let known = |field, cav: &CavId| {
+            if recorded.agents.contains(cav) {
+                return Ok(());
+            }
+            let found = recorded.agents.iter().map(ToString::to_string).collect();
+            Err(FleetError::NoVehicle { field, cav: cav.clone(), name: name.clone(), found })
+        };
+        scene.agents.iter().try_for_each(|cav| known("scene.agents", cav))?;
+        scenario.ego.id.iter().try_for_each(|cav| known("ego.id", cav))?;
+        scenario.vehicles.keys().try_for_each(|cav| known("vehicles", cav))?;
+        scenario.remote_agents.iter().try_for_each(|cav| known("remote_agents", cav))?;
+        let chosen = |cav: &&CavId| scene.agents.is_empty() || scene.agents.contains(cav);
+        let agents: Vec<CavId> = recorded.agents.iter().filter(chosen).cloned().collect();
+        let ego = scenario.ego.id.clone().unwrap_or_else(|| agents[0].clone());
+        for cav in &agents {
+            let pose = scenario.settings_of(cav).pose;
+            let needs_poses = matches!(pose, PoseSourceConfig::Recorded | PoseSourceConfig::Noisy(_));
+            let place = recorded.agents.iter().position(|known| known == cav);
+            if needs_poses && place.is_some_and(|place| !recorded.has_poses(place, scenario.scene.seek)) {
+                return Err(FleetError::NoPoses { cav: cav.clone(), source_name: pose.name(), name });
+            }
+        }
+        let scene = &mut scenario.scene;
+        let left = recorded.ticks.len() - scene.seek;
+        let ticks =
+            if scene.repeat { scene.frames } else { Some(scene.frames.map_or(left, |frames| frames.min(left))) };
+        let scene_dir = Some(scene.dir.join(&name)).filter(|folder| folder.is_dir()).unwrap_or(scene.dir.clone());
+        scene.scenario = Some(name);
+        scene.agents.clone_from(&agents);
+        scenario.ego.id = Some(ego.clone());
+        Ok(Self { scenario, agents, ego, ticks, scene_dir, detector, protocol })
+    }
+
+    /// Rule of the counted objects: those of the protocol inside the area of the model.
+    #[must_use]
+    pub(crate) fn ground_truth_rule(&self) -> GroundTruthRule {
+        self.protocol.rule_within(self.detector.lidar_range_m)
+    }
+
+    /// Number of values in one feature map of the model, as transmitted.
+    #[must_use]
+    pub(crate) fn map_values(&self) -> u64 {
+        let grid = self.detector.feature_grid();
+        u64::from(grid.width) * u64::from(grid.height) * self.detector.sent_channels() as u64
+    }
+
+    /// Name of the pose source that all vehicles share, or `mixed`.
+    #[must_use]
+    pub fn pose_source(&self) -> &'static str {
+        let mut names = self.agents.iter().map(|cav| self.scenario.settings_of(cav).pose.name());
+        let first = names.next().unwrap_or("recorded");
+        if names.all(|name| name == first) { first } else { "mixed" }
+    }
+
+    /// Principal of every process that the run may have, for its keys.
+    #[must_use]
+    pub(crate) fn parties(&self) -> Vec<Principal> {
+        let agents = self.agents.iter().map(|cav| Principal::new(Role::Agent, cav));
+        let egos = [Role::Ego, Role::Link].map(|role| Principal::new(role, &self.ego));
+        let others = [Role::Replay, Role::Scorer, Role::Recorder, Role::Viewer, Role::Ros2].map(Principal::of_role);
+        agents.chain(egos).chain(others).collect()
+    }
+
+    /// Keys of a run of this fleet, if its scenario asks for security.
+    ///
+    /// # Errors
+    /// [`KeyError`] when they cannot be made.
+    pub fn keys(&self, folder: &RunFolder) -> Result<Option<RunKeys>, KeyError> {
+        let security = self.scenario.security.as_ref();
+        security.map(|security| RunKeys::of(security, self.parties(), folder.path())).transpose()
+    }
+
+    /// Executables of a fleet.
+    #[must_use]
+    pub fn programs(programs: &Path) -> Vec<PathBuf> {
+        ["agent", "ego-fuser", "sim-replay", RUNNER].iter().map(|name| programs.join(name)).collect()
+    }
+
+    fn neighbours(&self) -> impl Iterator<Item = &CavId> {
+        self.agents.iter().filter(|cav| **cav != self.ego)
+    }
+
+    /// Messages that every vehicle publishes in addition to its pose.
+    pub(crate) fn publish(&self) -> Publish {
+        publish(self.scenario.method)
+    }
+}
+
+/// Messages that a method needs of every vehicle; the ego's own agent sends its feature map even where no other counts.
+fn publish(method: Method) -> Publish {
+    match method.exchange() {
+        Exchange::Nothing | Exchange::Features => Publish::Bev,
+        Exchange::Boxes => Publish::Boxes,
+        Exchange::Points => Publish::Points,
+    }
+}
+
+/// Options with which a scenario's data set is opened.
+pub(crate) fn open_options(scene: &SceneConfig) -> OpenOptions {
+    OpenOptions { intensity_scale: scene.intensity_scale, ..OpenOptions::default() }
+}
+
+/// Loads the networks of a pose source. Every vehicle loads them for itself; errors are better reported once.
+fn load_networks(pose: &PoseSourceConfig) -> Result<(), LocalizerError> {
+    match pose {
+        PoseSourceConfig::Pgc(PgcConfig { encoder, head, .. })
+        | PoseSourceConfig::Tracked(TrackedPoseConfig { encoder, head, .. }) => {
+            Localizer::load(encoder, head, Inference::default()).map(drop)
+        }
+        PoseSourceConfig::Baseline(network) => {
+            load_baseline(&network.weights, Device::Cpu, PoseSolver::default()).map(drop)
+        }
+        PoseSourceConfig::Recorded | PoseSourceConfig::Noisy(_) | PoseSourceConfig::Cached(_) => Ok(()),
+    }
+}

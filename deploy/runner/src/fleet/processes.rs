@@ -1,0 +1,203 @@
+//! Processes of a fleet: one resolved configuration each, written into the run folder.
+
+use std::net::SocketAddr;
+use std::path::Path;
+
+use agent::config::AgentConfig;
+use agent::rate::RateConfig;
+use bus::{BusConfig, Endpoint};
+use deploy::operate::run_folder::{CHECKPOINT, RECORDING, RunFolder, RunFolderError, SWEEP_LOG};
+use deploy::operate::security::RunKeys;
+use deploy::operate::supervise::{ProcessSpec, RestartPolicy};
+use deploy::operate::{RECORDER, REPLAY};
+use ego_fuser::config::EgoConfig;
+use fusion::Exchange;
+use protocol::{CavId, CodecConfig, RunId, Stream};
+use serde::Serialize;
+use sim_replay::config::{LinkProcessConfig, RecorderConfig, ReplayConfig, SensorLinkConfig, WaitConfig};
+
+use super::Fleet;
+use crate::scenario::Clock;
+
+/// Session context of the processes: run, router endpoint, program folder and run folder.
+#[derive(Debug, Clone, Copy)]
+pub struct SessionContext<'a> {
+    /// The run that they join.
+    pub run: &'a RunId,
+    /// Endpoint of the router.
+    pub endpoint: &'a Endpoint,
+    /// Keys of the processes, if the run has security.
+    pub keys: Option<&'a RunKeys>,
+    /// Folder of the programs.
+    pub programs: &'a Path,
+    /// Folder of the run.
+    pub folder: &'a RunFolder,
+}
+
+impl Fleet {
+    /// Every process to start, the recorder last if the scenario asks for one. Writes their configurations.
+    ///
+    /// # Errors
+    /// [`RunFolderError::Write`] when the run folder cannot be written.
+    pub fn processes(&self, context: &SessionContext<'_>) -> Result<Vec<ProcessSpec>, RunFolderError> {
+        let mut planner = self.planner(context);
+        self.plan_agents(&mut planner)?;
+        planner.plan(format!("ego-{}", self.ego), "ego-fuser run", RestartPolicy::Service, |bus| {
+            self.ego_config(context, bus)
+        })?;
+        if self.is_over_link() {
+            planner.plan(format!("link-{}", self.ego), "sim-replay link", RestartPolicy::Service, |bus| {
+                self.link_config(context, bus)
+            })?;
+        }
+        planner
+            .plan(REPLAY.into(), "sim-replay stream", RestartPolicy::Task, |bus| self.replay_config(context, bus))?;
+        if let Some(record) = &self.scenario.record {
+            let (run, out) = (context.run.clone(), context.folder.file(RECORDING));
+            let config = |bus| RecorderConfig { run, out, record: record.clone(), keep_running: false, bus };
+            // A recording cannot be resumed after an interruption.
+            planner.plan(RECORDER.into(), "sim-replay record --json", RestartPolicy::Optional, config)?;
+        }
+        Ok(planner.specs)
+    }
+
+    /// The agents that this run starts. Writes their configurations.
+    ///
+    /// # Errors
+    /// [`RunFolderError::Write`] when the run folder cannot be written.
+    pub(crate) fn agent_processes(&self, context: &SessionContext<'_>) -> Result<Vec<ProcessSpec>, RunFolderError> {
+        let mut planner = self.planner(context);
+        self.plan_agents(&mut planner)?;
+        Ok(planner.specs)
+    }
+
+    fn planner<'a>(&self, context: &'a SessionContext<'a>) -> Planner<'a> {
+        let bus = BusConfig {
+            connect: context.endpoint.clone(),
+            shared_memory_mib: self.scenario.network.shared_memory_mib,
+            supervised: true,
+            ..BusConfig::default()
+        };
+        Planner { context, bus, metrics: self.scenario.network.metrics, specs: Vec::new() }
+    }
+
+    fn plan_agents(&self, planner: &mut Planner<'_>) -> Result<(), RunFolderError> {
+        for cav in self.agents.iter().filter(|cav| !self.scenario.remote_agents.contains(cav)) {
+            let context = planner.context;
+            planner.plan(format!("agent-{cav}"), "agent run", RestartPolicy::Service, |bus| {
+                self.agent_config(cav, context, bus)
+            })?;
+        }
+        Ok(())
+    }
+
+    fn agent_config(&self, cav: &CavId, context: &SessionContext<'_>, bus: BusConfig) -> AgentConfig {
+        let mut settings = self.scenario.settings_of(cav);
+        let scene = self.scenario.scene.scenario.as_deref().unwrap_or_default();
+        let turn = self.agents.iter().position(|agent| agent == cav).and_then(|turn| u32::try_from(turn).ok());
+        settings.pose = settings.pose.for_scenario(scene).with_turn(turn.unwrap_or_default());
+        let is_ego = *cav == self.ego;
+        if is_ego {
+            // It sends to its own ego, not over the link, and the ego needs its complete feature map.
+            settings.codec = CodecConfig { gate: None, budget_bytes: None, ..settings.codec };
+            settings.rate = RateConfig::default();
+        } else {
+            settings.codec.gate = settings.codec.gate.or(self.scenario.method.gate());
+        }
+        let notes_sweeps = is_ego && self.scenario.clock == Clock::Wall;
+        AgentConfig {
+            run: context.run.clone(),
+            cav: cav.clone(),
+            models: self.scenario.models.clone(),
+            settings,
+            publish: vec![self.publish()],
+            keep_running: false,
+            sweep_log: notes_sweeps.then(|| context.folder.file(SWEEP_LOG)),
+            bus,
+        }
+    }
+
+    fn ego_config(&self, context: &SessionContext<'_>, bus: BusConfig) -> EgoConfig {
+        EgoConfig {
+            run: context.run.clone(),
+            models: self.scenario.models.clone(),
+            method: Some(self.scenario.method),
+            ego: self.scenario.ego.clone(),
+            neighbours: Vec::new(),
+            comm_range_m: self.protocol.ground_truth.comm_range_m,
+            over_link: self.is_over_link(),
+            keep_running: false,
+            bus,
+        }
+    }
+
+    fn link_config(&self, context: &SessionContext<'_>, bus: BusConfig) -> LinkProcessConfig {
+        LinkProcessConfig {
+            run: context.run.clone(),
+            ego: self.ego.clone(),
+            link: self.scenario.link.clone().unwrap_or_default(),
+            streams: vec![Stream::Pose, self.publish().stream(), Stream::Descriptor],
+            keep_running: false,
+            inbox: self.scenario.ego.inbox,
+            bus,
+        }
+    }
+
+    fn replay_config(&self, context: &SessionContext<'_>, bus: BusConfig) -> ReplayConfig {
+        let scene = &self.scenario.scene;
+        ReplayConfig {
+            run: context.run.clone(),
+            scene: scene.clone(),
+            wait: WaitConfig {
+                expect: self.recorded(self.routes()),
+                ready_timeout_s: self.scenario.timeouts.ready_s,
+                egos: vec![self.ego.clone()],
+                ..WaitConfig::default()
+            },
+            sensor_link: SensorLinkConfig::default(),
+            checkpoint: Some(context.folder.file(CHECKPOINT)),
+            bus,
+        }
+    }
+
+    /// True if the scenario emulates a link and the method sends anything through it.
+    pub(super) fn is_over_link(&self) -> bool {
+        self.scenario.link.is_some() && self.scenario.method.exchange() != Exchange::Nothing
+    }
+}
+
+/// Processes planned so far, and the settings that the next one shares with them.
+struct Planner<'a> {
+    context: &'a SessionContext<'a>,
+    bus: BusConfig,
+    /// Metrics address of the previous process; the next one takes the port after it.
+    metrics: Option<SocketAddr>,
+    specs: Vec<ProcessSpec>,
+}
+
+impl Planner<'_> {
+    /// Writes the configuration of a process; `command` is its program, subcommand and output format.
+    fn plan<C: Serialize>(
+        &mut self,
+        name: String,
+        command: &str,
+        life: RestartPolicy,
+        config: impl FnOnce(BusConfig) -> C,
+    ) -> Result<(), RunFolderError> {
+        let SessionContext { keys, programs, folder, .. } = self.context;
+        self.metrics = self.metrics.and_then(port_behind);
+        let keys = keys.map(|keys| keys.of_process(&name));
+        let bus = BusConfig { keys, metrics: self.metrics, ..self.bus.clone() };
+        let file = folder.write_config(&name, &config(bus))?;
+        let mut parts = command.split(' ');
+        let program = programs.join(parts.next().unwrap_or_default());
+        let mut args: Vec<_> = parts.map(Into::into).collect();
+        args.extend(["--config".into(), file.into()]);
+        self.specs.push(ProcessSpec { name, program, args, life, metrics: self.metrics });
+        Ok(())
+    }
+}
+
+fn port_behind(address: SocketAddr) -> Option<SocketAddr> {
+    Some(SocketAddr::new(address.ip(), address.port().checked_add(1)?))
+}

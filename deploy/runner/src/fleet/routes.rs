@@ -1,0 +1,65 @@
+//! Subscriptions that must be in place before the clock of a scene starts.
+
+use std::collections::BTreeSet;
+
+use bus::{Route, process_id};
+use deploy::operate::RECORDER;
+use deploy::score::scorer_cav;
+use fusion::Exchange;
+use protocol::{CavId, ProcessId, Role, Stream, Topic};
+
+use super::Fleet;
+
+impl Fleet {
+    /// Routes that must exist before the clock starts, in addition to those from the replay to the agents.
+    pub(super) fn routes(&self) -> Vec<Route> {
+        let ego = process_id(Role::Ego, &self.ego);
+        let scorer = process_id(Role::Scorer, &scorer_cav());
+        let route = |cav: &CavId, stream, receiver: &ProcessId| Route {
+            topic: Topic::Stream { cav: cav.clone(), stream },
+            receiver: receiver.clone(),
+        };
+        let mut routes = vec![
+            Route { topic: Topic::Truth, receiver: scorer.clone() },
+            route(&self.ego, Stream::Detections, &scorer),
+        ];
+        for cav in &self.agents {
+            routes.push(route(cav, Stream::Pose, &scorer));
+        }
+        let stream = self.publish().stream();
+        routes.push(route(&self.ego, stream, &ego));
+        // Ego-only: the ego subscribes to its own agent and to no other.
+        if self.scenario.method.exchange() == Exchange::Nothing {
+            return routes;
+        }
+        for cav in self.neighbours() {
+            if self.is_over_link() {
+                let topic = Topic::Received { ego: self.ego.clone(), cav: cav.clone(), stream };
+                routes.push(route(cav, stream, &process_id(Role::Link, &self.ego)));
+                routes.push(Route { topic, receiver: ego.clone() });
+            } else {
+                routes.push(route(cav, stream, &ego));
+            }
+        }
+        routes
+    }
+
+    /// The routes, and, if the run is recorded, those of the same topics and of the sensors to the recorder: messages
+    /// published before it subscribes are not recorded.
+    pub(super) fn recorded(&self, mut routes: Vec<Route>) -> Vec<Route> {
+        if self.scenario.record.is_some() {
+            let receiver = process_id(Role::Recorder, &recorder_cav());
+            let sensors = self.agents.iter().flat_map(|cav| {
+                [Stream::Lidar, Stream::Gnss, Stream::Imu].map(|stream| Topic::Stream { cav: cav.clone(), stream })
+            });
+            let topics: BTreeSet<Topic> = routes.iter().map(|route| route.topic.clone()).chain(sensors).collect();
+            routes.extend(topics.into_iter().map(|topic| Route { topic, receiver: receiver.clone() }));
+        }
+        routes
+    }
+}
+
+/// Id of the recorder in place of a vehicle's.
+fn recorder_cav() -> CavId {
+    CavId::new(RECORDER).expect("eight lower-case letters")
+}

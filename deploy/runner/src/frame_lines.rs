@@ -1,0 +1,74 @@
+//! Frame lines: `detections.jsonl` and `truth.jsonl` of frames that are evaluated offline or in simulation time.
+
+use std::fs::File;
+use std::io::{self, BufWriter, Write};
+use std::path::Path;
+
+use deploy::score::TruthLine;
+use ego_fuser_offline::evaluation::EvaluatedFrame;
+use protocol::{CavId, DetectionsReport};
+use serde::Serialize;
+
+/// The two files; the first error of writing is kept.
+pub(crate) struct FrameLines {
+    detections: BufWriter<File>,
+    truth: BufWriter<File>,
+    written: io::Result<()>,
+}
+
+/// A line of one scenario among several.
+#[derive(Serialize)]
+struct OfScenario<'a, T> {
+    #[serde(skip_serializing_if = "Option::is_none")]
+    scenario: Option<&'a str>,
+    #[serde(flatten)]
+    line: T,
+}
+
+impl FrameLines {
+    /// Empty files in a folder.
+    ///
+    /// # Errors
+    /// Those of the operating system.
+    pub(crate) fn create(folder: &Path) -> io::Result<Self> {
+        let create = |name: &str| File::create(folder.join(name)).map(BufWriter::new);
+        Ok(Self { detections: create("detections.jsonl")?, truth: create("truth.jsonl")?, written: Ok(()) })
+    }
+
+    /// Adds a frame, with the name of its scenario where there are several; false after an error.
+    pub(crate) fn add(&mut self, scenario: Option<&str>, frame: &EvaluatedFrame) -> bool {
+        if self.written.is_ok() {
+            let report = DetectionsReport::new(&frame.stamp, Some(frame.tick as u64), frame.result.clone());
+            let truth = truth_line(&frame.result.ego, frame);
+            let written = line(&mut self.detections, &OfScenario { scenario, line: report });
+            self.written = written.and_then(|()| line(&mut self.truth, &OfScenario { scenario, line: truth }));
+        }
+        self.written.is_ok()
+    }
+
+    /// Writes what is left.
+    ///
+    /// # Errors
+    /// The first of the operating system.
+    pub(crate) fn finish(mut self) -> io::Result<()> {
+        self.written.and_then(|()| self.detections.flush()).and_then(|()| self.truth.flush())
+    }
+}
+
+fn line(out: &mut impl Write, value: &impl Serialize) -> io::Result<()> {
+    serde_json::to_writer(&mut *out, value)?;
+    out.write_all(b"\n")
+}
+
+/// Ground truth of a computed tick.
+fn truth_line(ego: &CavId, frame: &EvaluatedFrame) -> TruthLine {
+    let own = frame.frames.iter().find(|recorded| recorded.cav == *ego);
+    TruthLine {
+        tick: frame.tick as u64,
+        capture_nanos: frame.stamp.capture_nanos,
+        publish_nanos: frame.stamp.capture_nanos,
+        ego: ego.clone(),
+        world_from_ego: own.and_then(|recorded| recorded.world_from_lidar),
+        boxes: frame.objects.clone(),
+    }
+}

@@ -1,0 +1,93 @@
+//! Agents of a run in simulation time, one process each.
+
+use std::path::Path;
+use std::sync::mpsc::channel;
+use std::thread;
+use std::time::Duration;
+
+use bus::shutdown::Stop;
+use bus::{Bus, Identity};
+use deploy::operate::network::RouterEndpoint;
+use deploy::operate::run_folder::RunFolder;
+use deploy::operate::security::RunKeys;
+use deploy::operate::supervise::{ProcessEventKind, Supervisor};
+use ego_fuser_offline::evaluation::EvaluateError;
+use ego_fuser_offline::evaluation::stepped::RemotePool;
+use protocol::{CavId, ProcessId, RunId};
+
+use crate::fleet::{Fleet, SessionContext};
+use crate::run::RunError;
+use crate::run::run_fleet::check_free;
+
+/// Name on the bus of the process that distributes the sweeps.
+const NAME: &str = "stepped";
+/// Longest time for closing the session.
+const LEAVE_LIMIT: Duration = Duration::from_secs(2);
+
+/// Agent processes and their session.
+pub(crate) struct CrewProcesses {
+    supervisor: Supervisor,
+    bus: Bus,
+    place: RouterEndpoint,
+    grace: Duration,
+    _keys: Option<RunKeys>,
+}
+
+impl CrewProcesses {
+    /// Starts an agent for each vehicle and waits until all have joined.
+    ///
+    /// # Errors
+    /// [`RunError`] when they cannot connect.
+    pub(crate) fn start(
+        fleet: &Fleet,
+        run: &RunId,
+        folder: &RunFolder,
+        programs: &Path,
+    ) -> Result<(Self, RemotePool), RunError> {
+        let keys = fleet.keys(folder)?;
+        let place = RouterEndpoint::open(&fleet.scenario.network, run, keys.as_ref())?;
+        let endpoint = &place.endpoint;
+        let specs = fleet.agent_processes(&SessionContext { run, endpoint, keys: keys.as_ref(), programs, folder })?;
+        check_free(&place, &fleet.scenario.network, run, &specs)?;
+        let identity = Identity {
+            run: run.clone(),
+            process: ProcessId::new(NAME).expect("lower-case letters"),
+            cav: CavId::new(NAME).expect("lower-case letters"),
+        };
+        let bus = Bus::over(place.session.clone(), identity)?;
+        let (events, happened) = channel();
+        // A restarted agent has lost its state, and the result would depend on the time of the crash.
+        let supervisor = Supervisor::start(specs, &folder.log_dir(), 0, &events)?;
+        let stop = Stop::new();
+        thread::spawn({
+            let stop = stop.clone();
+            move || {
+                for event in happened {
+                    if let ProcessEventKind::GaveUp { how, .. } = event.what {
+                        tracing::error!("{} {how}", event.name);
+                        stop.request();
+                    }
+                }
+            }
+        });
+        let stream = fleet.publish().stream();
+        let vehicles: Vec<_> = fleet.agents.iter().map(|cav| (cav.clone(), stream)).collect();
+        let timeouts = &fleet.scenario.timeouts;
+        let remote = RemotePool::connect(&bus, &vehicles, Duration::from_secs_f64(timeouts.ready_s), &stop)
+            .map_err(|error| EvaluateError::from(Box::new(error)))?;
+        let grace = Duration::from_secs_f64(timeouts.stop_s);
+        Ok((Self { supervisor, bus, place, grace, _keys: keys }, remote))
+    }
+
+    /// Ends all processes; returns the names of those that had to be killed.
+    pub(crate) fn end(self) -> Vec<String> {
+        let Self { supervisor, bus, place, grace, _keys } = self;
+        let killed = supervisor.stop(grace).killed;
+        for closed in [bus.leave(LEAVE_LIMIT), place.close()] {
+            if let Err(overdue) = closed {
+                tracing::warn!("{overdue}");
+            }
+        }
+        killed
+    }
+}

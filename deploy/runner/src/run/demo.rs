@@ -1,0 +1,57 @@
+//! Picture of a run: the frame with the most neighbours, with the points of every fused vehicle.
+
+use std::path::{Path, PathBuf};
+
+use dataset::{self, LoadOptions};
+use deploy::score::{FrameScores, JudgedFrame};
+use protocol::{CavId, Pose};
+
+use crate::fleet::Fleet;
+use crate::run::picture::{Picture, View};
+
+/// Draws that frame of a run. A picture that cannot be drawn is a warning: the run itself is complete.
+pub fn draw(fleet: &Fleet, board: &FrameScores, path: &Path) -> Option<PathBuf> {
+    let frame = board.showpiece()?;
+    match try_draw(fleet, frame, path) {
+        Ok(()) => Some(path.to_path_buf()),
+        Err(error) => {
+            tracing::warn!("no picture of the run: {error}");
+            None
+        }
+    }
+}
+
+fn try_draw(fleet: &Fleet, frame: &JudgedFrame, path: &Path) -> Result<(), Box<dyn std::error::Error>> {
+    let pose_of = |cav: &CavId| frame.world_from_lidar.iter().find(|(known, _)| known == cav).map(|(_, pose)| *pose);
+    let world_from_ego: Pose = pose_of(&fleet.ego).ok_or("the truth names no pose of the ego")?;
+    let dataset = dataset::open(&fleet.scenario.scene.dir)?;
+    let name = fleet.scenario.scene.scenario.as_deref();
+    let scenario = dataset.scenarios.iter().find(|known| Some(known.name.as_str()) == name);
+    let scenario = scenario.ok_or("the scene is gone")?;
+    let options = LoadOptions { lidar_variant: fleet.scenario.scene.variant.clone(), ..LoadOptions::default() };
+    let shown = std::iter::once(&fleet.ego).chain(frame.result.fused.iter().map(|neighbour| &neighbour.cav));
+    let mut loaded = Vec::new();
+    for cav in shown {
+        let (Some(index), Some(world_from_cav)) = (scenario.agents.iter().position(|agent| agent == cav), pose_of(cav))
+        else {
+            continue;
+        };
+        let recorded = scenario.load(index, usize::try_from(frame.tick)?, &options)?;
+        loaded.push((cav.to_string(), world_from_ego.from_world(&world_from_cav), recorded.points.xyzi));
+    }
+    let rule = fleet.ground_truth_rule();
+    let detections = frame.result.detections.iter().map(|detection| (detection.box3d, detection.score)).collect();
+    Picture {
+        title: format!("{}  tick {}  {}", fleet.scenario.method, frame.tick, scenario.name),
+        x_m: rule.x_m,
+        y_m: rule.y_m,
+        views: loaded
+            .iter()
+            .map(|(name, ego_from_cav, xyzi)| View { name: name.clone(), ego_from_cav: *ego_from_cav, xyzi })
+            .collect(),
+        truth: frame.truth.clone(),
+        detections,
+    }
+    .save(path)?;
+    Ok(())
+}

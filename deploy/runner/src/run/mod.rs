@@ -1,0 +1,14 @@
+//! One run of a fleet, live or in simulation time: from a scenario to the metrics in its run folder.
+
+pub(crate) mod agent_pool;
+pub mod capacity;
+pub mod demo;
+pub(crate) mod ledger_report;
+pub(crate) mod loss;
+pub(crate) mod machine;
+mod picture;
+mod run_error;
+pub mod run_fleet;
+pub mod stepped;
+
+pub use run_error::RunError;

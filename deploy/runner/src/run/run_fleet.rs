@@ -1,0 +1,375 @@
+//! One run from beginning to end: plan, start, watch, end, score, write.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+use std::sync::mpsc::channel;
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+use bus::shutdown::Stop;
+use bus::{Endpoint, MetricsPeer, Rejection};
+use deploy::operate::network::{Network, RouterEndpoint};
+use deploy::operate::progress::Display;
+use deploy::operate::run_folder::{RunFolder, RunFolderError, SWEEP_LOG, name_of_now};
+use deploy::operate::security::RefusalWatch;
+use deploy::operate::status::Phase;
+use deploy::operate::status_reporter::{Ending, StatusReporter};
+use deploy::operate::supervise::{ProcessSpec, Supervisor};
+use deploy::operate::{RECORDER, REPLAY};
+use deploy::report::{self, Capacity, RunReport};
+use deploy::score::metrics::Metrics;
+use deploy::score::offline_intervals;
+use deploy::score::{FrameScores, Progress, Scored, ScorerNode};
+use protocol::{Ledger, Reconciliation, RunId};
+use support::output;
+
+use crate::fleet::{Fleet, SessionContext};
+use crate::run::RunError;
+use crate::run::capacity::{estimate_apart, remedies};
+use crate::run::ledger_report::LedgerReport;
+use crate::run::loss;
+use crate::scenario::fingerprint::Provenance;
+use crate::scenario::{Clock, Scenario};
+
+/// Update interval of the display.
+const BEAT: Duration = Duration::from_millis(100);
+/// Fraction of the time for ending after which the replay must have ended.
+const REPLAY_SHARE: f64 = 0.25;
+/// Fraction of the time for ending after which the last results must have arrived.
+const DRAIN_SHARE: f64 = 0.5;
+
+/// For writing the index of a recording, after all others have ended.
+const RECORDER_SHARE: Duration = Duration::from_millis(800);
+
+/// Files of results and of ground truth, a line each.
+const LINES: [&str; 2] = ["detections.jsonl", "truth.jsonl"];
+
+/// Settings of a run beside its scenario.
+#[derive(Debug, Clone)]
+pub struct RunOptions {
+    /// Folder of the run folders.
+    pub runs: PathBuf,
+    /// Folder of the programs `agent`, `ego-fuser` and `sim-replay`.
+    pub programs: PathBuf,
+    /// First part of the name of an unnamed run.
+    pub prefix: &'static str,
+}
+
+/// Result of a run.
+#[derive(Debug)]
+pub struct RunResult {
+    /// Folder of the run.
+    pub folder: RunFolder,
+    /// Metrics of the run.
+    pub metrics: Metrics,
+    /// Message accounting: the discrepancies between senders and receivers.
+    pub balance: Reconciliation,
+    /// Number of ticks for which the ego published nothing.
+    pub missed: u64,
+    /// True if the run was interrupted before its end.
+    pub interrupted: bool,
+    /// Processes that did not end in time and were killed.
+    pub killed: Vec<String>,
+    /// Files of the run that could not be written, with the reason (for example a full disk).
+    pub unwritten: Vec<String>,
+    /// Processes that failed in their task, with the reason.
+    pub failures: Vec<String>,
+    /// Processes that crashed at least once.
+    pub crashed: Vec<String>,
+    /// Changes that would let the fleet answer more ticks; `None` in simulation time, where it answers all.
+    pub remedies: Option<String>,
+    /// Pace, stages and resources.
+    pub report: RunReport,
+    /// Picture of one fused frame, if one could be drawn.
+    pub picture: Option<PathBuf>,
+}
+
+impl RunResult {
+    /// True if data were lost beyond the drops of the link.
+    #[must_use]
+    pub fn lost_data(&self) -> bool {
+        loss::sentence(self).is_some()
+    }
+}
+
+/// Runs a scenario to its end, or until Ctrl-C.
+///
+/// # Errors
+/// [`RunError`] when the run cannot start, or a process stays down.
+pub fn run_scenario(scenario: &Scenario, options: &RunOptions) -> Result<RunResult, RunError> {
+    if scenario.clock == Clock::Stepped {
+        return crate::run::stepped::run_scenario(scenario, options);
+    }
+    let fleet = Fleet::plan(scenario)?;
+    let run = fleet.scenario.run.clone().unwrap_or_else(|| name_of_now(options.prefix));
+    let folder = RunFolder::create(&options.runs, &run)?;
+    let result = go(&fleet, options, &run, &folder);
+    if result.as_ref().is_err_and(RunError::is_refusal) {
+        folder.remove();
+    }
+    result
+}
+
+/// Prints what this machine can carry. A run whose pace cannot be estimated goes on without.
+fn announce_capacity(fleet: &Fleet, programs: &Path) -> Option<Capacity> {
+    let capacity = estimate_apart(fleet, programs).unwrap_or_else(|error| {
+        tracing::warn!("the pace of the run cannot be estimated: {error}");
+        None
+    })?;
+    output::note(format_args!("this machine: {capacity}"));
+    if !capacity.keeps_up() {
+        output::note(format_args!("it will not keep up; {} would help", remedies(fleet, Some(&capacity))));
+    }
+    Some(capacity)
+}
+
+/// Runs a fleet under the given run name in the given folder.
+fn go(fleet: &Fleet, options: &RunOptions, run: &RunId, folder: &RunFolder) -> Result<RunResult, RunError> {
+    let stop = Stop::new();
+    stop.on_signals().map_err(RunError::Signals)?;
+    // Before anything else of the run takes the cores.
+    let capacity = announce_capacity(fleet, &options.programs);
+    let fingerprint = fingerprint(fleet, &options.programs);
+
+    let keys = fleet.keys(folder)?;
+    let place = RouterEndpoint::open(&fleet.scenario.network, run, keys.as_ref())?;
+    let (endpoint, programs) = (&place.endpoint, options.programs.as_path());
+    let context = SessionContext { run, endpoint, keys: keys.as_ref(), programs, folder };
+    let specs = fleet.processes(&context)?;
+    check_free(&place, &fleet.scenario.network, run, &specs)?;
+    let refused = RefusalWatch::over(&place)?;
+    let board = FrameScores::new(fleet.ego.clone(), fleet.ground_truth_rule(), fleet.map_values());
+    let files = LINES.map(|name| folder.file(name));
+    let mut scorer = ScorerNode::start(place.session.clone(), run, &fleet.agents, &fleet.ego, board, files)?;
+    if let Some(address) = fleet.scenario.network.metrics {
+        let peer = |spec: &ProcessSpec| Some(MetricsPeer { process: spec.name.clone(), address: spec.metrics? });
+        scorer.serve_metrics(address, specs.iter().filter_map(peer).collect())?;
+    }
+    let watched = watch(fleet, &context, specs, &place.endpoint, &scorer, &stop);
+    // Before the scorer closes the session.
+    let refused = refused.finish();
+    let scored = scorer.finish();
+    if let Err(overdue) = place.close() {
+        tracing::warn!("{overdue}");
+    }
+    let watched = watched?;
+
+    let result = write(fleet, (run, folder.clone()), (scored, &refused), &watched, fingerprint, capacity);
+    match watched.ending {
+        Ending::Over | Ending::Asked => Ok(result),
+        Ending::Failed { process, how } => {
+            let log = result.folder.log_dir().join(format!("{process}.log"));
+            Err(RunError::Process { process, how, log })
+        }
+    }
+}
+
+/// Checks that none of the processes to start, nor a scorer, is already present on a shared router.
+///
+/// # Errors
+/// [`RunError::Live`] names those present; [`RunError::Network`] when the router does not answer.
+pub(super) fn check_free(
+    place: &RouterEndpoint,
+    network: &Network,
+    run: &RunId,
+    specs: &[ProcessSpec],
+) -> Result<(), RunError> {
+    let processes = place.present(network, run, specs)?;
+    if processes.is_empty() {
+        return Ok(());
+    }
+    Err(RunError::Live { run: run.clone(), router: place.endpoint.to_string(), processes })
+}
+
+/// Observations of the supervisor during a run.
+struct Watched {
+    ending: Ending,
+    /// Processes that had to be killed at the end.
+    killed: Vec<String>,
+    /// Processes that were offline for some time.
+    offline: BTreeSet<String>,
+    /// Processes that failed in their task, with the reason.
+    failures: Vec<String>,
+    /// Processes that crashed at least once.
+    crashed: Vec<String>,
+}
+
+/// Arrival time of each sweep at the ego's agent, by capture time. An agent on another host writes none.
+fn swept(log: &Path) -> BTreeMap<u64, u64> {
+    support::sweep_log::read(log).unwrap_or_else(|error| {
+        if error.kind() != std::io::ErrorKind::NotFound {
+            tracing::warn!("{}: {error}; frames.csv lacks the arrival times of the sweeps", log.display());
+        }
+        BTreeMap::new()
+    })
+}
+
+/// Starts the processes, follows the run to its end, and ends the processes.
+fn watch(
+    fleet: &Fleet,
+    context: &SessionContext<'_>,
+    specs: Vec<ProcessSpec>,
+    endpoint: &Endpoint,
+    scorer: &ScorerNode,
+    stop: &Stop,
+) -> Result<Watched, RunError> {
+    let SessionContext { run, folder, .. } = *context;
+    let (events, happened) = channel();
+    let mut display = Display::new(fleet.ticks);
+    if let Some(address) = fleet.scenario.network.metrics {
+        display.print_line(&format!("metrics of all processes at http://{address}/metrics"));
+    }
+    let restarts = fleet.scenario.timeouts.restarts;
+    display.print_line(&format!(
+        "run {run} at {endpoint}: {} processes, logs in {}",
+        specs.len(),
+        folder.log_dir().display()
+    ));
+    let mut supervisor = Supervisor::start(specs, &folder.log_dir(), restarts, &events)?;
+    let mut watch = StatusReporter::new(&fleet.scenario.timeouts, run, endpoint, folder);
+    let ending = watch.follow(&supervisor, &happened, scorer, stop, &mut display);
+    let mut offline = scorer.absent();
+    let crashed = watch.fallen();
+    offline.extend(crashed.iter().cloned());
+    watch.tell(Phase::Ending, &scorer.progress());
+    let limits = Limits::of(fleet, &ending);
+    let mut killed = supervisor.end(|name| name == REPLAY, limits.replay).killed;
+    drain(&supervisor, scorer, limits.drain, &mut display);
+    killed.extend(supervisor.end(|name| name.starts_with("agent"), limits.all).killed);
+    // The recorder captures the last messages of all others.
+    killed.extend(supervisor.end(|name| name != RECORDER, limits.all).killed);
+    killed.extend(supervisor.end(|_| true, limits.all + RECORDER_SHARE).killed);
+    display.finish();
+    while let Ok(event) = happened.try_recv() {
+        watch.note(&event);
+    }
+    watch.tell(Phase::Over, &scorer.progress());
+    offline.extend(killed.iter().cloned());
+    let failures = watch.failures();
+    Ok(Watched { ending, killed, offline, failures, crashed })
+}
+
+/// Deadlines of the steps of the end.
+struct Limits {
+    replay: Instant,
+    drain: Instant,
+    all: Instant,
+}
+
+impl Limits {
+    /// After Ctrl-C everything has to end within `stop_s`; a run that is over waits for its last results first.
+    fn of(fleet: &Fleet, ending: &Ending) -> Self {
+        let timeouts = &fleet.scenario.timeouts;
+        let now = Instant::now();
+        let after = |seconds: f64| now + Duration::from_secs_f64(seconds);
+        match ending {
+            Ending::Over => {
+                Self { replay: now, drain: after(timeouts.drain_s), all: after(timeouts.drain_s + timeouts.stop_s) }
+            }
+            Ending::Asked => Self {
+                replay: after(timeouts.stop_s * REPLAY_SHARE),
+                drain: after(timeouts.stop_s * DRAIN_SHARE),
+                all: after(timeouts.stop_s),
+            },
+            Ending::Failed { .. } => Self { replay: after(timeouts.stop_s), drain: now, all: after(timeouts.stop_s) },
+        }
+    }
+}
+
+/// Waits until the ego has reported every tick, or the time is over.
+fn drain(supervisor: &Supervisor, scorer: &ScorerNode, until: Instant, display: &mut Display) {
+    while !supervisor.all_ended() && Instant::now() < until {
+        let progress = scorer.progress();
+        display.update(&progress);
+        // The number of ticks is final only after the replay's last report.
+        if progress.ended && progress.frames >= progress.ticks {
+            return;
+        }
+        std::thread::sleep(BEAT.min(until.saturating_duration_since(Instant::now())));
+    }
+}
+
+/// Hashes programs, weights and scene during the run.
+fn fingerprint(fleet: &Fleet, programs: &Path) -> JoinHandle<std::io::Result<Provenance>> {
+    let (programs, weights) = (Fleet::programs(programs), fleet.scenario.models.weights.clone());
+    let scene = fleet.scene_dir.clone();
+    let poses = fleet.scenario.poses();
+    std::thread::spawn(move || Provenance::collect(&programs, &weights, &poses, &scene))
+}
+
+/// Writes the run folder; files that cannot be written are listed in the result, which is not lost with them.
+fn write(
+    fleet: &Fleet,
+    (run, folder): (&RunId, RunFolder),
+    (scored, refused): (Scored, &BTreeMap<Rejection, u64>),
+    watched: &Watched,
+    fingerprint: JoinHandle<std::io::Result<Provenance>>,
+    capacity: Option<Capacity>,
+) -> RunResult {
+    let Scored { board, stats, progress, unwritten: lines } = scored;
+    let mut unwritten = Vec::new();
+    for (name, lines) in LINES.iter().zip(lines).filter(|(_, lines)| *lines > 0) {
+        unwritten.push(format!("{lines} lines are missing in {}", folder.file(name).display()));
+    }
+    let mut note = |written: Result<(), RunFolderError>| {
+        if let Err(error) = written {
+            unwritten.push(error.to_string());
+        }
+    };
+    let mut sum = Ledger::default();
+    for process in &stats {
+        sum.merge(&process.ledger);
+    }
+    let exempted = sum.exempt(|account| offline_intervals::concerns(&watched.offline, account));
+    let balance = sum.balance();
+    let missed = missed(fleet, &board, &watched.ending);
+    let metrics = metrics(fleet, &board, &progress, &sum);
+    let metrics = Metrics { ticks: metrics.answered + missed, ..metrics };
+    note(folder.write_json("metrics.json", &metrics));
+    let remedies = remedies(fleet, capacity.as_ref());
+    let run_report = RunReport::new(run, &metrics, board.records(), &stats, capacity);
+    note(folder.write_json(report::FILE, &run_report));
+    note(folder.write_frames(board.records(), &swept(&folder.file(SWEEP_LOG))));
+    let report = LedgerReport::new(&stats, &sum, &balance, (&watched.offline, exempted)).with_refused(refused);
+    note(folder.write_json("ledger.json", &report));
+    let provenance = match fingerprint.join() {
+        Ok(Ok(provenance)) => Some(provenance),
+        Ok(Err(error)) => {
+            tracing::warn!("no hashes in scenario.yaml: {error}");
+            None
+        }
+        Err(_) => None,
+    };
+    let resolved = Scenario { run: Some(run.clone()), provenance, ..fleet.scenario.clone() };
+    note(folder.write("scenario.yaml", &resolved.to_yaml()));
+    let picture = crate::run::demo::draw(fleet, &board, &folder.file("frame.png"));
+    let interrupted = matches!(watched.ending, Ending::Asked);
+    RunResult {
+        folder,
+        metrics,
+        balance,
+        missed,
+        interrupted,
+        killed: watched.killed.clone(),
+        unwritten,
+        failures: watched.failures.clone(),
+        crashed: watched.crashed.clone(),
+        remedies: Some(remedies),
+        report: run_report,
+        picture,
+    }
+}
+
+/// Ticks without a result. Those that no process reported, as the replay crashed with them in transit, are known by
+/// their number only, once the scene is over.
+fn missed(fleet: &Fleet, board: &FrameScores, ending: &Ending) -> u64 {
+    let (reported, _) = board.ticks();
+    let played = fleet.ticks.filter(|_| matches!(ending, Ending::Over)).unwrap_or(0) as u64;
+    board.missed() + played.saturating_sub(reported)
+}
+
+fn metrics(fleet: &Fleet, board: &FrameScores, progress: &Progress, sum: &Ledger) -> Metrics {
+    let seconds = progress.span.map_or(0.0, |(first, last)| last.duration_since(first).as_secs_f64());
+    let names = [fleet.scenario.method.name(), fleet.pose_source()];
+    Metrics::of(board, "wall", names, seconds, sum, None)
+}

@@ -1,0 +1,205 @@
+//! `clock: stepped`: a scenario in simulation time, in this process alone, or with one process per agent.
+//!
+//! The run folder is that of a live run. Only `scenario.yaml` and `log/` depend on machine, load, time of day and
+//! number of processes.
+
+use std::collections::BTreeSet;
+use std::ops::ControlFlow;
+use std::path::PathBuf;
+
+use agent::config::AgentSettings;
+use dataset::{self, Scenario as Recorded};
+use deploy::operate::run_folder::{RunFolder, RunFolderError, name_of_now};
+use deploy::report::{self, RunReport};
+use deploy::score::FrameScores;
+use deploy::score::metrics::Metrics;
+use ego_fuser_offline::evaluation::stepped::{AgentPool, ComputeTimes, SteppedConfig, VehicleConfig};
+use ego_fuser_offline::evaluation::{EvaluateConfig, EvaluateError, EvaluatedFrame, Evaluator};
+use link::LinkConfig;
+use localization::pose_source::PoseSourceConfig;
+use protocol::{CavId, RunId};
+use support::progress;
+
+use crate::evaluated_frame::judge;
+use crate::fleet::{Fleet, FleetError, open_options};
+use crate::frame_lines::FrameLines;
+use crate::run::RunError;
+use crate::run::agent_pool::CrewProcesses;
+use crate::run::ledger_report::LedgerReport;
+use crate::run::run_fleet::{RunOptions, RunResult};
+use crate::scenario::fingerprint::Provenance;
+use crate::scenario::{Scenario, Stepped};
+
+/// Runs a scenario in simulation time to its end.
+///
+/// # Errors
+/// [`RunError`] when no fleet can be built from the scenario, or a frame cannot be read or computed.
+pub fn run_scenario(scenario: &Scenario, options: &RunOptions) -> Result<RunResult, RunError> {
+    let mut fleet = Fleet::plan(scenario)?;
+    fleet.scenario.models.threads.apply();
+    let recorded = recorded(&fleet)?;
+    let mut evaluator = Evaluator::new(evaluate_config(&fleet))?;
+    let compute = match fleet.scenario.stepped.as_ref().and_then(|stepped| stepped.compute) {
+        Some(compute) => compute,
+        None => evaluator.measure(&recorded)?,
+    };
+    // Written into the run's scenario, from which another run can take it.
+    let processes = fleet.scenario.stepped.is_some_and(|stepped| stepped.processes);
+    fleet.scenario.stepped = Some(Stepped { compute: Some(compute), processes });
+    let run = fleet.scenario.run.clone().unwrap_or_else(|| name_of_now(options.prefix));
+    let mut evaluator = evaluator.with_link(stepped_config(&fleet, compute)?);
+    let folder = RunFolder::create(&options.runs, &run)?;
+    let result = go(&fleet, &recorded, &mut evaluator, (&run, &folder), options);
+    if result.as_ref().is_err_and(RunError::is_refusal) {
+        folder.remove();
+    }
+    result
+}
+
+/// Runs a fleet under the given run name in the given folder.
+fn go(
+    fleet: &Fleet,
+    recorded: &Recorded,
+    evaluator: &mut Evaluator,
+    (run, folder): (&RunId, &RunFolder),
+    options: &RunOptions,
+) -> Result<RunResult, RunError> {
+    let processes = fleet.scenario.stepped.is_some_and(|stepped| stepped.processes);
+    let crew = processes.then(|| CrewProcesses::start(fleet, run, folder, &options.programs)).transpose()?;
+    let processes = crew.map(|(processes, remote)| {
+        evaluator.set_processes(Some(remote));
+        processes
+    });
+    let board = play(fleet, recorded, evaluator, folder)?;
+    evaluator.set_processes(None);
+    let killed = processes.map(CrewProcesses::end).unwrap_or_default();
+    let result = write(fleet, evaluator, &board, (run, folder.clone()), options)?;
+    Ok(RunResult { killed, ..result })
+}
+
+/// Recorded scenario of the fleet.
+pub(super) fn recorded(fleet: &Fleet) -> Result<Recorded, FleetError> {
+    let scene = &fleet.scenario.scene;
+    let scenarios = dataset::open_with(&scene.dir, &open_options(scene))?.scenarios;
+    let found = scenarios.into_iter().find(|known| Some(&known.name) == scene.scenario.as_ref());
+    found.ok_or_else(|| FleetError::Empty(scene.dir.clone()))
+}
+
+pub(super) fn evaluate_config(fleet: &Fleet) -> EvaluateConfig {
+    let scenario = &fleet.scenario;
+    EvaluateConfig {
+        weights: scenario.models.weights.clone(),
+        precision: scenario.models.precision,
+        method: Some(scenario.method),
+        pose_source: for_scene(&scenario.agents.pose, scenario),
+        codec: scenario.agents.codec,
+        rate: scenario.agents.rate,
+        protocol: Some(fleet.protocol.clone()),
+        delay_nanos: 0,
+        attack: None,
+        trust: scenario.ego.trust(),
+    }
+}
+
+fn stepped_config(fleet: &Fleet, compute: ComputeTimes) -> Result<SteppedConfig, FleetError> {
+    let Scenario { scene, ego, link, .. } = &fleet.scenario;
+    let (config, link_folder, seed) = match link {
+        Some(link) => {
+            let (config, folder) = LinkConfig::open(&link.model)?;
+            (config, folder, link.seed)
+        }
+        None => (LinkConfig::default(), PathBuf::from("."), 0),
+    };
+    let others = fleet.agents.iter().filter(|cav| **cav != fleet.ego);
+    let vehicles = fleet.agents.iter().map(|cav| (cav.clone(), vehicle(&fleet.scenario, cav)));
+    let last = fleet.ticks.map_or(usize::MAX, |ticks| scene.seek + ticks);
+    Ok(SteppedConfig {
+        link: config,
+        link_folder,
+        seed,
+        deadline_nanos: ego.deadline_ms.saturating_mul(1_000_000),
+        pairing: ego.pairing(),
+        compute,
+        crew: AgentPool::Named(std::iter::once(&fleet.ego).chain(others).cloned().collect()),
+        vehicles: vehicles.collect(),
+        ticks: scene.seek..last,
+        lidar_variant: scene.variant.clone(),
+    })
+}
+
+fn vehicle(scenario: &Scenario, cav: &CavId) -> VehicleConfig {
+    let AgentSettings { pose, codec, rate, falsification } = scenario.settings_of(cav);
+    VehicleConfig { pose_source: for_scene(&pose, scenario), codec, rate, falsification }
+}
+
+/// The source as in the configuration of an agent's process.
+fn for_scene(pose: &PoseSourceConfig, scenario: &Scenario) -> PoseSourceConfig {
+    pose.for_scenario(scenario.scene.scenario.as_deref().unwrap_or_default())
+}
+
+/// Computes all ticks; detections are appended to their file.
+fn play(
+    fleet: &Fleet,
+    recorded: &Recorded,
+    evaluator: &mut Evaluator,
+    folder: &RunFolder,
+) -> Result<FrameScores, RunError> {
+    let mut board = FrameScores::new(fleet.ego.clone(), fleet.ground_truth_rule(), fleet.map_values());
+    let unwritable = |source| RunFolderError::Write { path: folder.path().to_owned(), source };
+    let mut lines = FrameLines::create(folder.path()).map_err(unwritable)?;
+    let bar = progress::bar(fleet.ticks.unwrap_or(0), "ticks");
+    let _ = evaluator.run(recorded, &mut |frame: EvaluatedFrame| {
+        bar.inc(1);
+        let is_written = lines.add(None, &frame);
+        judge(&mut board, frame, true);
+        if is_written { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
+    })?;
+    bar.finish_and_clear();
+    lines.finish().map_err(unwritable)?;
+    Ok(board)
+}
+
+fn write(
+    fleet: &Fleet,
+    evaluator: &Evaluator,
+    board: &FrameScores,
+    (run, folder): (&RunId, RunFolder),
+    options: &RunOptions,
+) -> Result<RunResult, RunError> {
+    let ledger = evaluator.ledger();
+    let balance = ledger.balance();
+    let names = [fleet.scenario.method.name(), fleet.pose_source()];
+    let metrics = Metrics::of(board, "stepped", names, board.seconds(), ledger, Some(evaluator.sent_bytes()));
+    folder.write_json("metrics.json", &metrics)?;
+    let report = RunReport::new(run, &metrics, board.records(), &[], None);
+    folder.write_json(report::FILE, &report)?;
+    folder.write_frames(board.records(), &std::collections::BTreeMap::new())?;
+    folder.write_json("ledger.json", &LedgerReport::new(&[], ledger, &balance, (&BTreeSet::new(), 0)))?;
+    let models = &fleet.scenario.models;
+    let programs = Fleet::programs(&options.programs);
+    let provenance = Provenance::collect(&programs, &models.weights, &fleet.scenario.poses(), &fleet.scene_dir);
+    let provenance = provenance.inspect_err(|error| tracing::warn!("no hashes in scenario.yaml: {error}")).ok();
+    let resolved = Scenario { provenance, ..fleet.scenario.clone() };
+    folder.write("scenario.yaml", &resolved.to_yaml())?;
+    let picture = crate::run::demo::draw(fleet, board, &folder.file("frame.png"));
+    Ok(RunResult {
+        folder,
+        metrics,
+        balance,
+        missed: 0,
+        interrupted: false,
+        killed: Vec::new(),
+        unwritten: Vec::new(),
+        failures: Vec::new(),
+        crashed: Vec::new(),
+        remedies: None,
+        report,
+        picture,
+    })
+}
+
+impl From<EvaluateError> for RunError {
+    fn from(error: EvaluateError) -> Self {
+        Self::Evaluate(Box::new(error))
+    }
+}

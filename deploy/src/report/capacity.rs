@@ -1,0 +1,74 @@
+//! Capacity: what a machine was expected to carry before a run, as its report states it.
+
+use std::fmt;
+
+use serde::{Deserialize, Serialize};
+
+/// Share of the ticks from which a run counts as keeping up.
+const KEEPS_UP: f64 = 0.99;
+
+/// Cores and instruction set.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Machine {
+    /// Number of cores that this process may use.
+    pub cores: usize,
+    /// Vector instructions, for example `AVX-512, VNNI, AMX`.
+    pub instructions: String,
+}
+
+/// Estimate of the pace of a live run.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Capacity {
+    /// The machine.
+    pub machine: Machine,
+    /// Fusion method.
+    pub method: String,
+    /// Number of vehicles.
+    pub vehicles: usize,
+    /// Number of these whose agents run on this machine.
+    pub local_vehicles: usize,
+    /// CPU time of an agent per frame, milliseconds.
+    pub agent_ms: f64,
+    /// CPU time of the fusion per frame, milliseconds.
+    pub fuse_ms: f64,
+    /// Time between two frames, milliseconds.
+    pub period_ms: f64,
+    /// Speed of a core while the others compute too and other programs run, relative to one of an idle machine, 0..=1.
+    pub shared_speed: f64,
+    /// CPU time per frame of all processes on this machine, milliseconds.
+    pub needed_ms: f64,
+    /// CPU time that the cores give per frame, milliseconds of a core that computes alone.
+    pub available_ms: f64,
+    /// Expected share of answered frames, 0..=1.
+    pub expected_share: f64,
+}
+
+impl Capacity {
+    /// True if all frames are expected to be answered.
+    #[must_use]
+    pub fn keeps_up(&self) -> bool {
+        self.expected_share >= KEEPS_UP
+    }
+
+    /// Replay rate at which the machine is expected to keep up, relative to the current one: a multiple of 0.05 below
+    /// the expected share.
+    #[must_use]
+    pub fn relative_rate(&self) -> f64 {
+        ((self.expected_share * 20.0 * 0.95).floor() / 20.0).max(0.05)
+    }
+}
+
+impl fmt::Display for Capacity {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { machine: Machine { cores, instructions }, method, vehicles, needed_ms, available_ms, .. } = self;
+        let plural = |count: usize| if count == 1 { "" } else { "s" };
+        write!(
+            f,
+            "{cores} core{}, {instructions}; {method} with {vehicles} vehicle{} needs about {needed_ms:.0} ms of CPU per \
+             frame of {available_ms:.0} available: expect about {} of 10 frames answered",
+            plural(*cores),
+            plural(*vehicles),
+            (10.0 * self.expected_share).round()
+        )
+    }
+}

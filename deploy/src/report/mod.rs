@@ -1,0 +1,131 @@
+//! `report.json`: pace, latency, stages, CPU, memory and bytes of a run that has ended.
+
+mod capacity;
+mod pace;
+mod resources;
+mod text;
+
+use std::path::{Path, PathBuf};
+
+use protocol::RunId;
+use serde::{Deserialize, Serialize};
+use support::bounded_file;
+use support::statistics::{quantile, sorted};
+
+pub use capacity::{Capacity, Machine};
+pub use pace::{AgentPace, Pace};
+pub use resources::{ProcessResources, StageTimes, StreamBytes};
+
+use crate::score::metrics::Metrics;
+use crate::score::{FrameRecord, ProcessStats};
+
+/// File name.
+pub const FILE: &str = "report.json";
+/// Largest file that is read, bytes: a report of 65 vehicles has less than one.
+const MAX_BYTES: u64 = 16 << 20;
+
+/// Report of a run.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct RunReport {
+    /// Name of the run.
+    pub run: String,
+    /// Fusion method.
+    pub method: String,
+    /// Name of the pose source.
+    pub pose_source: String,
+    /// Clock of the run: `wall` or `stepped`.
+    pub clock: String,
+    /// Estimate from before the run; `None` if none was made.
+    pub capacity: Option<Capacity>,
+    /// Share of answered ticks, and intervals between detections.
+    pub pace: Pace,
+    /// From the publication of a tick to that of its detections, milliseconds.
+    pub latency_ms: Spread,
+    /// Stages by kind of process.
+    pub stages: Vec<StageTimes>,
+    /// CPU time and memory of every process.
+    pub processes: Vec<ProcessResources>,
+    /// Published bytes by stream.
+    pub streams: Vec<StreamBytes>,
+}
+
+/// Quantiles of a sample; `null` for an empty one.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+pub struct Spread {
+    /// Median.
+    pub p50: Option<f64>,
+    /// 95th percentile.
+    pub p95: Option<f64>,
+    /// Maximum.
+    pub max: Option<f64>,
+}
+
+impl Spread {
+    /// Quantiles of `sample`.
+    fn of(sample: &[f64]) -> Self {
+        let sorted = sorted(sample);
+        Self { p50: quantile(&sorted, 0.50), p95: quantile(&sorted, 0.95), max: sorted.last().copied() }
+    }
+}
+
+/// Reason why a run has no report.
+#[derive(Debug, thiserror::Error)]
+pub enum ReportError {
+    /// The file cannot be read.
+    #[error("{}: {source}; is it the folder of a run that has ended?", path.display())]
+    Read {
+        /// Path of the file.
+        path: PathBuf,
+        /// Error of the operating system.
+        source: std::io::Error,
+    },
+    /// The file is no report.
+    #[error("{}: {problem}", path.display())]
+    Syntax {
+        /// Path of the file.
+        path: PathBuf,
+        /// Description of the error.
+        problem: String,
+    },
+}
+
+impl RunReport {
+    /// Report from the ticks of a run, its metrics, and the last reports of its processes (none in simulation time).
+    #[must_use]
+    pub fn new(
+        run: &RunId,
+        metrics: &Metrics,
+        records: &[FrameRecord],
+        processes: &[ProcessStats],
+        capacity: Option<Capacity>,
+    ) -> Self {
+        let latencies: Vec<f64> = records.iter().filter_map(|record| record.latency_ms).collect();
+        let pace = Pace::of(metrics, records, processes);
+        Self {
+            run: run.to_string(),
+            method: metrics.method.clone(),
+            pose_source: metrics.pose_source.clone(),
+            clock: metrics.clock.clone(),
+            capacity,
+            latency_ms: Spread::of(&latencies),
+            stages: resources::stages(processes),
+            processes: resources::processes(processes, &pace),
+            streams: resources::streams(processes),
+            pace,
+        }
+    }
+
+    /// Reads the report in the folder of a run.
+    ///
+    /// # Errors
+    /// [`ReportError`] names the file.
+    pub fn read(folder: &Path) -> Result<Self, ReportError> {
+        let path = folder.join(FILE);
+        let text = bounded_file::read_text(&path, MAX_BYTES)
+            .map_err(|source| ReportError::Read { path: path.clone(), source })?;
+        serde_json::from_str(&text).map_err(|error| ReportError::Syntax { path, problem: error.to_string() })
+    }
+}
+
+#[cfg(test)]
+mod tests;
