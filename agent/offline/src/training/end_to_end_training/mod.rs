@@ -129,6 +129,7 @@ pub fn train_end_to_end(
     while share_done(&trainer) < 1.0 {
         let (loss, error_m) = examples.next_loss(&network)?;
         trainer.step(&loss, share_done(&trainer))?;
+        trainer.check_interruption(&variables)?;
         window.push(error_m);
         let step = trainer.steps();
         if step.is_multiple_of(REPORT_EVERY) {

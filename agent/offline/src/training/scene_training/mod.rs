@@ -80,6 +80,7 @@ pub(crate) fn train_scene_on(
     let mut last_validation = Instant::now();
     while training.share_done() < 1.0 {
         training.step()?;
+        training.trainer.check_interruption(&training.variables)?;
         if training.trainer.steps().is_multiple_of(REPORT_EVERY) {
             observe(&training.report());
         }
@@ -186,7 +187,7 @@ impl<'a> Training<'a> {
             Length::Time(limit) => {
                 // The schedule of the head begins when the features are computed.
                 let limit = (limit.as_secs_f64() - self.preparing_seconds).max(1.0);
-                (self.trainer.seconds() - self.preparing_seconds) / limit
+                self.trainer.seconds_of_steps() / limit
             }
             _ => self.trainer.share_done(self.order.passes()),
         }
