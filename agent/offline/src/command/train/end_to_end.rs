@@ -7,20 +7,16 @@ use localization::competitors::EndToEndKind;
 use localization::pgc::SceneEncoderConfig;
 use perception::train::{ModelCard, TrainingBar, TrainingOptions};
 
-use super::options::{check_folders, print_left_out, run_config};
+use super::options::{SceneSweeps, check_folders, print_left_out, run_config};
 
 /// Train a competitor of the localizer on one scene; writes checkpoint, weights.safetensors and model-card.md.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Folders of sweeps, all of the same scene.
-    #[arg(long, required = true, num_args = 1.., value_name = "DIR")]
-    scenes: Vec<PathBuf>,
+    #[command(flatten)]
+    sweeps: SceneSweeps,
     /// Target of the regression: coordinates of cells after SGLoc, or the pose itself from pooled features.
     #[arg(long, value_enum)]
     regresses: Regresses,
-    /// Name of the scene, for messages and the model card.
-    #[arg(long, default_value = "scene")]
-    scene_name: String,
     /// Weights of a frozen encoder [default: the encoder is trained from random weights with the rest].
     #[arg(long, value_name = "FILE")]
     encoder: Option<PathBuf>,
@@ -44,14 +40,14 @@ enum Regresses {
 }
 
 pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
-    check_folders(&args.scenes)?;
+    check_folders(&args.sweeps.scenes)?;
     let config = EndToEndTrainConfig {
-        scenes: args.scenes.clone(),
+        scenes: args.sweeps.scenes.clone(),
         regresses: match args.regresses {
             Regresses::SgLoc => EndToEndKind::SgLoc,
             Regresses::Pose => EndToEndKind::Pose,
         },
-        scene_name: args.scene_name.clone(),
+        scene_name: args.sweeps.scene_name.clone(),
         encoder: match &args.encoder {
             Some(path) => EncoderStart::Frozen(path.clone()),
             None => EncoderStart::Untrained(SceneEncoderConfig::lean()),
