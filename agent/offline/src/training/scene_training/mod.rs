@@ -313,6 +313,7 @@ fn head_config(config: &SceneTrainConfig, features: &Features) -> Result<SceneHe
         origin_m: training.origin_m,
         max_cells: MAX_CELLS,
         refiner: config.refiner.then(refiner).transpose()?,
+        sweep_points: median_points(&training.points),
     })
 }
 
@@ -323,6 +324,13 @@ struct Window {
     error_m: f64,
     epsilon_m: f64,
     refined_m: f64,
+}
+
+/// Median of the sweeps' numbers of points.
+fn median_points(points: &[usize]) -> Option<usize> {
+    let mut sorted = points.to_vec();
+    sorted.sort_unstable();
+    sorted.get(sorted.len() / 2).copied()
 }
 
 fn mean(values: &Tensor) -> Result<f64, tch::TchError> {
