@@ -28,7 +28,8 @@ pub(crate) const OFFLINE: Sibling = Sibling {
 #[derive(Debug, Parser)]
 #[command(
     version,
-    after_help = "Exit codes: 0 done, 1 failed, 2 bad usage or input, 3 data could not be used and were left out."
+    after_help = "Exit codes: 0 done, 1 failed, 2 bad usage or input, 3 data could not be used and were left out, 130 \
+                  a training was stopped by Ctrl-C."
 )]
 pub(crate) struct Cli {
     #[command(subcommand)]

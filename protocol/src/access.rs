@@ -9,7 +9,7 @@
 //! | `scorer` | control | the truth, detections, poses, statistics |
 //! | `recorder` | nothing | everything but previews |
 //! | `viewer` | nothing | results, descriptors, previews of sweeps, images, statistics |
-//! | `ros2` | sweeps of every vehicle | sweeps, motion, poses, detections, statistics |
+//! | `ros2` | sweeps and motion of every vehicle | sweeps, motion, poses, detections, statistics |
 //!
 //! In addition every process declares a liveliness token and publishes its readiness and its ledger, each under its own
 //! name.
@@ -122,7 +122,7 @@ impl Principal {
             Role::Ros2 => {
                 let streams = [Stream::Lidar, Stream::Imu, Stream::Pose, Stream::Detections];
                 let subscribed = streams.iter().map(|stream| everyones(stream)).chain([keys(&"stats/*")]);
-                (vec![everyones(&Stream::Lidar)], subscribed.collect())
+                ([Stream::Lidar, Stream::Imu].iter().map(|stream| everyones(stream)).collect(), subscribed.collect())
             }
         };
         let right = |act| move |keys: KeyExpr| Permission { act, keys };

@@ -50,6 +50,7 @@ pub fn write(folder: &Path, seed: i64) -> (PathBuf, PathBuf) {
         origin_m: [0.0; 3],
         max_cells: 500,
         refiner: None,
+        sweep_points: None,
     };
     let network = VarStore::new(Device::Cpu);
     SceneHead::new(&network.root(), &config).expect("a configuration that fits");

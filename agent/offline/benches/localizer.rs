@@ -66,6 +66,7 @@ fn head_config(encoder: &SceneEncoderConfig) -> SceneHeadConfig {
         origin_m: [0.0; 3],
         max_cells: 1024,
         refiner: None,
+        sweep_points: None,
     }
 }
 

@@ -15,7 +15,8 @@ use crate::command;
     name = "agent",
     bin_name = "agent",
     version,
-    after_help = "Exit codes: 0 done, 1 failed, 2 bad usage or input, 3 data could not be used and were left out."
+    after_help = "Exit codes: 0 done, 1 failed, 2 bad usage or input, 3 data could not be used and were left out, 130 \
+                  a training was stopped by Ctrl-C."
 )]
 pub(crate) struct Cli {
     #[command(subcommand)]

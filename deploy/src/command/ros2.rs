@@ -5,9 +5,9 @@ use std::path::PathBuf;
 use anyhow::Context;
 use bus::shutdown::Stop;
 use bus::{Bus, BusOptions, Credentials, Endpoint, Identity, STOP_LIMIT, open, process_id};
-use deploy::ros::{LidarSource, NodeOptions, NodeReport, RosSession, run};
+use deploy::ros::{AgentTopic, MotionReport, MotionSource, NodeOptions, NodeReport, RosSession, run};
 use protocol::{CavId, Role, RunId};
-use ros2::{Distribution, Mount, RosName};
+use ros2::{Distribution, MotionType, Mount, RosName};
 use support::cli::{BadInput, Outcome};
 use support::output;
 
@@ -30,7 +30,7 @@ pub(crate) struct Arguments {
     #[command(flatten)]
     content: Content,
     #[command(flatten)]
-    lidar: Lidar,
+    sensors: Sensors,
 }
 
 /// The ROS 2 network.
@@ -69,17 +69,27 @@ struct Content {
     initialpose: Option<CavId>,
 }
 
-/// LiDARs of the ROS 2 network.
+/// Sensors of the ROS 2 network.
 #[derive(Debug, clap::Args)]
-#[command(next_help_heading = "LiDARs of the ROS 2 network")]
-struct Lidar {
+#[command(next_help_heading = "Sensors of the ROS 2 network")]
+struct Sensors {
     /// Pass the sensor_msgs/PointCloud2 of a topic to an agent as its LiDAR, for example /velodyne_points=1000;
     /// repeatable.
     #[arg(long, value_name = "TOPIC=AGENT", allow_hyphen_values = true)]
-    lidar: Vec<LidarSource>,
+    lidar: Vec<AgentTopic>,
     /// Largest intensity of these messages, 255 for many drivers; agents get shares of it, 0 to 1.
     #[arg(long, value_name = "VALUE", default_value_t = 1.0, value_parser = above_zero)]
     intensity_max: f32,
+    /// Pass speed and yaw rate of a topic of nav_msgs/Odometry to an agent that has a --lidar, for example /odom=1000;
+    /// repeatable.
+    #[arg(long, value_name = "TOPIC=AGENT", allow_hyphen_values = true)]
+    odometry: Vec<AgentTopic>,
+    /// The same of a topic of geometry_msgs/TwistStamped, in the frame of the body.
+    #[arg(long, value_name = "TOPIC=AGENT", allow_hyphen_values = true)]
+    twist: Vec<AgentTopic>,
+    /// The yaw rate of a topic of sensor_msgs/Imu with its z axis up; that of --odometry and --twist is not used then.
+    #[arg(long, value_name = "TOPIC=AGENT", allow_hyphen_values = true)]
+    imu: Vec<AgentTopic>,
 }
 
 /// Distributions of ROS 2 by what their rmw_zenoh writes into keys.
@@ -119,18 +129,11 @@ impl Arguments {
             tracing::warn!("{overdue}");
         }
         print(&report, self.json)?;
-        Ok(Outcome::of(!report.lidar.is_complete() || report.left_out > 0))
+        Ok(Outcome::of(!report.is_complete() || report.left_out > 0))
     }
 
-    /// Two LiDARs of one vehicle would be one.
     fn check(&self) -> anyhow::Result<()> {
-        let sources = &self.lidar.lidar;
-        for (index, source) in sources.iter().enumerate() {
-            if let Some(other) = sources.iter().take(index).find(|other| other.cav == source.cav) {
-                let (first, second, cav) = (&other.topic, &source.topic, &source.cav);
-                return Err(BadInput::new(format!("--lidar: {first} and {second} are both the LiDAR of {cav}")).into());
-            }
-        }
+        self.sensors.check()?;
         if self.network.ros_router.is_none() && self.keys.is_some() {
             return Err(
                 BadInput::new("--ros-router: nodes of ROS 2 have no certificates; name a router for them").into()
@@ -159,16 +162,56 @@ impl Arguments {
     }
 
     fn options(&self) -> NodeOptions {
-        let (content, lidar) = (&self.content, &self.lidar);
+        let (content, sensors) = (&self.content, &self.sensors);
         NodeOptions {
             with_points: !content.no_points,
             // The sweeps of a robot have the time of its clock, not of a scene.
-            with_clock: content.clock.unwrap_or(lidar.lidar.is_empty()),
+            with_clock: content.clock.unwrap_or(sensors.lidar.is_empty()),
             mount: content.lidar_mount.unwrap_or_default(),
-            lidars: lidar.lidar.clone(),
-            max_intensity: lidar.intensity_max,
+            lidars: sensors.lidar.clone(),
+            motions: sensors.motions(),
+            max_intensity: sensors.intensity_max,
             initial_pose_of: content.initialpose.clone(),
         }
+    }
+}
+
+impl Sensors {
+    /// Rejects two sensors of one kind for one vehicle, and motions of vehicles without a LiDAR.
+    fn check(&self) -> anyhow::Result<()> {
+        let speeds: Vec<AgentTopic> = self.odometry.iter().chain(&self.twist).cloned().collect();
+        for (option, what, sources) in
+            [("--lidar", "LiDAR", &self.lidar), ("--odometry, --twist", "speed", &speeds), ("--imu", "IMU", &self.imu)]
+        {
+            for (index, source) in sources.iter().enumerate() {
+                if let Some(other) = sources.iter().take(index).find(|other| other.cav == source.cav) {
+                    let (first, second, cav) = (&other.topic, &source.topic, &source.cav);
+                    let message = format!("{option}: {first} and {second} are both the {what} of {cav}");
+                    return Err(BadInput::new(message).into());
+                }
+            }
+        }
+        let has_lidar = |cav: &CavId| self.lidar.iter().any(|lidar| lidar.cav == *cav);
+        match self.motions().into_iter().map(|motion| motion.source).find(|source| !has_lidar(&source.cav)) {
+            Some(AgentTopic { topic, cav }) => {
+                let message = format!("{topic}={cav}: an agent's motion goes with its sweeps; name its --lidar too");
+                Err(BadInput::new(message).into())
+            }
+            None => Ok(()),
+        }
+    }
+
+    fn motions(&self) -> Vec<MotionSource> {
+        let topics = [
+            (MotionType::Odometry, &self.odometry),
+            (MotionType::TwistStamped, &self.twist),
+            (MotionType::Imu, &self.imu),
+        ];
+        let of_type = |(motion_type, sources): (MotionType, &Vec<AgentTopic>)| {
+            let source = |source: &AgentTopic| MotionSource { motion_type, source: source.clone() };
+            sources.iter().map(source).collect::<Vec<_>>()
+        };
+        topics.into_iter().flat_map(of_type).collect()
     }
 }
 
@@ -196,6 +239,12 @@ fn print(report: &NodeReport, as_json: bool) -> anyhow::Result<()> {
             "{} sweeps passed to agents, {} superseded, {} repeated",
             lidar.sweeps, lidar.superseded, lidar.repeated
         ))?;
+    }
+    if lidar.sweeps_without_motion > 0 {
+        output::line(format_args!("{} of these without a motion", lidar.sweeps_without_motion))?;
+    }
+    for (topic, MotionReport { read, unreadable }) in &report.motion {
+        output::line(format_args!("{read} messages of {topic} read, {unreadable} could not be read"))?;
     }
     if lidar.unreadable > 0 {
         output::line(format_args!("{} messages of LiDARs could not be read", lidar.unreadable))?;

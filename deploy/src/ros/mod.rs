@@ -1,18 +1,24 @@
-//! Node of a ROS 2 network: publishes a run through rmw_zenoh's keys, and takes in sweeps of LiDARs.
+//! Node of a ROS 2 network: publishes a run through rmw_zenoh's keys, and takes in sweeps of LiDARs and odometry.
 //!
 //! - [`RosSession`]: session on the ROS 2 network, with the tokens by which other nodes see this one.
-//! - [`run()`]: from the run to the ROS 2 network, and from its LiDARs to the agents of the run.
+//! - [`run()`]: from the run to the ROS 2 network, and from its LiDARs and its odometry to the agents of the run.
 //!
 //! Run and ROS 2 network have a session each: they may have different routers, and the run may have access control.
 
+mod agent_topic;
 mod initial_pose;
 mod lidar_input;
+mod motion_input;
+mod motion_series;
 mod node;
 mod publisher;
+mod refusal_log;
 mod scene_clock;
 mod session;
 mod sweeps;
 
-pub use lidar_input::{LidarReport, LidarSource, LidarSourceError};
+pub use agent_topic::{AgentTopic, AgentTopicError};
+pub use lidar_input::LidarReport;
+pub use motion_input::{MotionReport, MotionSource};
 pub use node::{NodeOptions, NodeReport, run};
 pub use session::RosSession;

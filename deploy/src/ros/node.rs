@@ -13,8 +13,10 @@ use protocol::{CavId, KeyExpr, Kind, Limits, Message, Role, Stream, Topic, wire}
 use ros2::{Mount, RosTopic, Translator, VehicleTopic};
 use serde::Serialize;
 
+use super::agent_topic::AgentTopic;
 use super::initial_pose::InitialPose;
-use super::lidar_input::{LidarInputs, LidarReport, LidarSource};
+use super::lidar_input::{LidarInputs, LidarReport};
+use super::motion_input::{MotionReport, MotionSource};
 use super::publisher::RosPublisher;
 use super::scene_clock::SceneClock;
 use super::session::RosSession;
@@ -37,7 +39,9 @@ pub struct NodeOptions {
     /// Place of the LiDARs on their vehicles.
     pub mount: Mount,
     /// LiDARs of the ROS 2 network that are those of agents.
-    pub lidars: Vec<LidarSource>,
+    pub lidars: Vec<AgentTopic>,
+    /// Motions of these agents in the ROS 2 network.
+    pub motions: Vec<MotionSource>,
     /// Largest intensity that they publish; passed on are shares of it.
     pub max_intensity: f32,
     /// Vehicle whose first fix is published on `/initialpose`.
@@ -51,6 +55,7 @@ impl Default for NodeOptions {
             with_clock: true,
             mount: Mount::default(),
             lidars: Vec::new(),
+            motions: Vec::new(),
             max_intensity: 1.0,
             initial_pose_of: None,
         }
@@ -66,6 +71,16 @@ pub struct NodeReport {
     pub left_out: u64,
     /// Messages of LiDARs.
     pub lidar: LidarReport,
+    /// Messages of motions, by topic.
+    pub motion: BTreeMap<String, MotionReport>,
+}
+
+impl NodeReport {
+    /// True if every message of a sensor could be read.
+    #[must_use]
+    pub fn is_complete(&self) -> bool {
+        self.lidar.is_complete() && self.motion.values().all(|motion| motion.unreadable == 0)
+    }
 }
 
 /// Connects the run of `bus` with a ROS 2 network until `stop` is requested.
@@ -87,7 +102,7 @@ pub fn run(bus: &Bus, session: &RosSession, options: &NodeOptions, stop: &Stop) 
     });
     let _watched = watched.into_iter().collect::<Result<Vec<_>, _>>()?;
     let inputs = (!options.lidars.is_empty())
-        .then(|| LidarInputs::open(bus, session, &options.lidars, options.max_intensity, stop))
+        .then(|| LidarInputs::open(bus, session, (&options.lidars, &options.motions), options.max_intensity, stop))
         .transpose()?;
     let presence = bus.announce(Role::Ros2)?;
     let report = std::thread::scope(|scope| {
@@ -95,8 +110,8 @@ pub fn run(bus: &Bus, session: &RosSession, options: &NodeOptions, stop: &Stop) 
         let followed = follow(scope, (bus, session, options), &tap, &members);
         // After an error the threads of the LiDARs have to end too.
         stop.request();
-        let lidar = reading.map(|reading| reading.join().unwrap_or_default()).unwrap_or_default();
-        followed.map(|report| NodeReport { lidar, ..report })
+        let (lidar, motion) = reading.map(|reading| reading.join().unwrap_or_default()).unwrap_or_default();
+        followed.map(|report| NodeReport { lidar, motion, ..report })
     })?;
     presence.withdraw()?;
     Ok(report)
@@ -113,7 +128,7 @@ fn follow<'scope, 'env>(
     let followed = node.follow(tap, members);
     std::mem::take(&mut node.sweeps).into_values().for_each(Forwarding::end);
     let left_out = node.left_out + tap.overwritten() + tap.undelivered();
-    followed.map(|()| NodeReport { published: node.published, left_out, lidar: LidarReport::default() })
+    followed.map(|()| NodeReport { published: node.published, left_out, ..NodeReport::default() })
 }
 
 /// Sweeps of one vehicle, forwarded on a thread of their own.

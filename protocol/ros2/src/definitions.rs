@@ -19,6 +19,8 @@ pub(crate) const POSE_WITH_COVARIANCE_STAMPED: Definition =
     ("geometry_msgs/PoseWithCovarianceStamped", "std_msgs/Header header\ngeometry_msgs/PoseWithCovariance pose\n");
 pub(crate) const TWIST: Definition =
     ("geometry_msgs/Twist", "geometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular\n");
+pub(crate) const TWIST_STAMPED: Definition =
+    ("geometry_msgs/TwistStamped", "std_msgs/Header header\ngeometry_msgs/Twist twist\n");
 pub(crate) const TWIST_WITH_COVARIANCE: Definition =
     ("geometry_msgs/TwistWithCovariance", "geometry_msgs/Twist twist\nfloat64[36] covariance\n");
 pub(crate) const TRANSFORM: Definition =
@@ -32,6 +34,12 @@ pub(crate) const ODOMETRY: Definition = (
     "nav_msgs/Odometry",
     "std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/PoseWithCovariance pose\n\
      geometry_msgs/TwistWithCovariance twist\n",
+);
+pub(crate) const IMU: Definition = (
+    "sensor_msgs/Imu",
+    "std_msgs/Header header\ngeometry_msgs/Quaternion orientation\nfloat64[9] orientation_covariance\n\
+     geometry_msgs/Vector3 angular_velocity\nfloat64[9] angular_velocity_covariance\n\
+     geometry_msgs/Vector3 linear_acceleration\nfloat64[9] linear_acceleration_covariance\n",
 );
 pub(crate) const CLOCK: Definition = ("rosgraph_msgs/Clock", "builtin_interfaces/Time clock\n");
 

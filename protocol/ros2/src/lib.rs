@@ -1,7 +1,8 @@
 //! ROS 2 without ROS: messages in CDR, type hashes, and the keys, tokens and attachments of rmw_zenoh.
 //!
 //! This crate links no network. The recorder writes what [`Translator`] makes of a message into bags, `v2vloc ros2`
-//! publishes the same on a ROS 2 network, and reads sweeps of LiDARs with [`read_point_cloud`].
+//! publishes the same on a ROS 2 network, and reads sweeps of LiDARs with [`read_point_cloud`], odometry and gyroscopes
+//! with [`MotionType::read`].
 //!
 //! | topic | type | from | quality of service |
 //! | --- | --- | --- | --- |
@@ -28,18 +29,22 @@ mod cdr;
 mod definitions;
 mod encode;
 pub mod endpoint;
+mod motion;
 pub mod names;
 mod point_cloud;
 mod qos;
+mod read;
 mod ros_type;
 mod topic;
 mod translator;
 mod type_hash;
 
 pub use encode::{Mount, MountError, clock, pose, static_transforms};
+pub use motion::{MotionError, MotionType, TimedMotion};
 pub use names::{NameError, RosName};
 pub use point_cloud::{PointCloudError, Sweep, SweepLimits, read_point_cloud};
 pub use qos::Qos;
+pub use read::ReadError;
 pub use ros_type::RosType;
 pub use topic::{RosTopic, VehicleTopic};
 pub use translator::{RosMessage, Translator};

@@ -7,6 +7,8 @@
 use protocol::PointCloud;
 use re_cdr::{BigEndian, ByteOrder, CdrReader, LittleEndian};
 
+use crate::read::{Body, Header, ReadError, Reader};
+
 /// More fields than any driver publishes.
 const MAX_FIELDS: u32 = 256;
 
@@ -28,32 +30,9 @@ pub struct Sweep {
 /// Error of a message that is no point cloud, or one that cannot be read.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum PointCloudError {
-    /// The encapsulation header names another encoding.
-    #[error("encoding {found:?}, not 00 00 or 00 01 (CDR)")]
-    Encoding {
-        /// First bytes of the message.
-        found: Vec<u8>,
-    },
-    /// The message ends early, or a text or flag in it is malformed.
-    #[error("{field} at byte {at} of {len}: {cause}")]
-    Cdr {
-        /// Field that is read.
-        field: &'static str,
-        /// Position, bytes after the encapsulation header.
-        at: usize,
-        /// Length of the message.
-        len: usize,
-        /// Error of the decoder.
-        cause: String,
-    },
-    /// The capture time is before 1970 or has more than 10^9 nanoseconds.
-    #[error("header.stamp is {sec} s and {nanosec} ns, not a time from 1970 on")]
-    Stamp {
-        /// Seconds.
-        sec: i32,
-        /// Nanoseconds.
-        nanosec: u32,
-    },
+    /// The message is no CDR, ends early or has no time.
+    #[error(transparent)]
+    Message(#[from] ReadError),
     /// A coordinate is missing.
     #[error("no field {missing:?} among {found:?}")]
     NoField {
@@ -113,10 +92,9 @@ pub struct SweepLimits {
 /// # Errors
 /// [`PointCloudError`] names the field and both values.
 pub fn read_point_cloud(bytes: &[u8], limits: SweepLimits) -> Result<Sweep, PointCloudError> {
-    match bytes.split_first_chunk() {
-        Some(([0, 0, _, _], body)) => Reader::<BigEndian>::new(body).sweep(limits),
-        Some(([0, 1, _, _], body)) => Reader::<LittleEndian>::new(body).sweep(limits),
-        _ => Err(PointCloudError::Encoding { found: bytes.iter().take(4).copied().collect() }),
+    match Body::of(bytes)? {
+        Body::BigEndian(message) => read_sweep(message, limits),
+        Body::LittleEndian(message) => read_sweep(message, limits),
     }
 }
 
@@ -267,76 +245,46 @@ impl Layout {
     }
 }
 
-/// Reader of one message in byte order `BO`.
-struct Reader<'a, BO> {
-    cdr: CdrReader<'a, BO>,
-    len: usize,
+fn read_sweep<BO: ByteOrder>(mut message: Reader<'_, BO>, limits: SweepLimits) -> Result<Sweep, PointCloudError> {
+    let Header { nanos, frame_id } = message.header()?;
+    let (height, width) = (message.u32("height")?, message.u32("width")?);
+    let fields = read_fields(&mut message)?;
+    // Values are in the order that the flag states, whatever the order of the message.
+    let is_big_endian = message.read("is_bigendian", CdrReader::read_u8)? != 0;
+    let (point_step, row_step) = (message.u32("point_step")?, message.u32("row_step")?);
+    let data = message.read("data", CdrReader::read_byte_sequence)?;
+    let columns = Columns::find(&fields)?;
+    let layout = Layout { height, width, point_step, row_step };
+    layout.check(&columns, data.len(), limits)?;
+    let mut sweep = Sweep {
+        capture_nanos: nanos,
+        frame_id: frame_id.into(),
+        points: PointCloud::default(),
+        without_return: 0,
+        too_far: 0,
+    };
+    if is_big_endian {
+        sweep.fill::<BigEndian>(data, &layout, &columns, limits.max_abs_value);
+    } else {
+        sweep.fill::<LittleEndian>(data, &layout, &columns, limits.max_abs_value);
+    }
+    Ok(sweep)
 }
 
-impl<'a, BO: ByteOrder> Reader<'a, BO> {
-    fn new(body: &'a [u8]) -> Self {
-        Self { cdr: CdrReader::new(body), len: body.len() }
+fn read_fields<'a, BO: ByteOrder>(message: &mut Reader<'a, BO>) -> Result<Vec<Field<'a>>, PointCloudError> {
+    let count = message.u32("length of fields")?;
+    if count > MAX_FIELDS {
+        return Err(PointCloudError::TooMany { what: "fields", found: count.into(), max: MAX_FIELDS.into() });
     }
-
-    fn read<T>(
-        &mut self,
-        field: &'static str,
-        read: impl FnOnce(&mut CdrReader<'a, BO>) -> re_cdr::Result<T>,
-    ) -> Result<T, PointCloudError> {
-        let at = self.cdr.position();
-        let len = self.len;
-        read(&mut self.cdr).map_err(|cause| PointCloudError::Cdr { field, at, len, cause: cause.to_string() })
-    }
-
-    fn u32(&mut self, field: &'static str) -> Result<u32, PointCloudError> {
-        self.read(field, CdrReader::read_u32)
-    }
-
-    fn sweep(mut self, limits: SweepLimits) -> Result<Sweep, PointCloudError> {
-        let sec = self.read("header.stamp.sec", CdrReader::read_i32)?;
-        let nanosec = self.u32("header.stamp.nanosec")?;
-        let seconds = u64::try_from(sec).ok().filter(|_| nanosec < 1_000_000_000);
-        let seconds = seconds.ok_or(PointCloudError::Stamp { sec, nanosec })?;
-        let frame_id = self.read("header.frame_id", CdrReader::read_str)?;
-        let (height, width) = (self.u32("height")?, self.u32("width")?);
-        let fields = self.fields()?;
-        // Values are in the order that the flag states, whatever the order of the message.
-        let is_big_endian = self.read("is_bigendian", CdrReader::read_u8)? != 0;
-        let (point_step, row_step) = (self.u32("point_step")?, self.u32("row_step")?);
-        let data = self.read("data", CdrReader::read_byte_sequence)?;
-        let columns = Columns::find(&fields)?;
-        let layout = Layout { height, width, point_step, row_step };
-        layout.check(&columns, data.len(), limits)?;
-        let mut sweep = Sweep {
-            capture_nanos: seconds * 1_000_000_000 + u64::from(nanosec),
-            frame_id: frame_id.into(),
-            points: PointCloud::default(),
-            without_return: 0,
-            too_far: 0,
-        };
-        if is_big_endian {
-            sweep.fill::<BigEndian>(data, &layout, &columns, limits.max_abs_value);
-        } else {
-            sweep.fill::<LittleEndian>(data, &layout, &columns, limits.max_abs_value);
-        }
-        Ok(sweep)
-    }
-
-    fn fields(&mut self) -> Result<Vec<Field<'a>>, PointCloudError> {
-        let count = self.u32("length of fields")?;
-        if count > MAX_FIELDS {
-            return Err(PointCloudError::TooMany { what: "fields", found: count.into(), max: MAX_FIELDS.into() });
-        }
-        let field = |_| {
-            Ok(Field {
-                name: self.read("fields.name", CdrReader::read_str)?,
-                offset: self.u32("fields.offset")?,
-                datatype: self.read("fields.datatype", CdrReader::read_u8)?,
-                count: self.u32("fields.count")?,
-            })
-        };
-        (0..count).map(field).collect()
-    }
+    let field = |_| {
+        Ok(Field {
+            name: message.read("fields.name", CdrReader::read_str)?,
+            offset: message.u32("fields.offset")?,
+            datatype: message.read("fields.datatype", CdrReader::read_u8)?,
+            count: message.u32("fields.count")?,
+        })
+    };
+    (0..count).map(field).collect()
 }
 
 impl Sweep {

@@ -17,6 +17,8 @@ pub enum RosType {
     Detection3dArray,
     /// `diagnostic_msgs/msg/DiagnosticArray`.
     DiagnosticArray,
+    /// `sensor_msgs/msg/Imu`.
+    Imu,
     /// `visualization_msgs/msg/MarkerArray`.
     MarkerArray,
     /// `nav_msgs/msg/Odometry`.
@@ -27,21 +29,25 @@ pub enum RosType {
     PoseWithCovarianceStamped,
     /// `tf2_msgs/msg/TFMessage`.
     TfMessage,
+    /// `geometry_msgs/msg/TwistStamped`.
+    TwistStamped,
 }
 
 impl RosType {
     /// Every type.
-    pub const ALL: [Self; 10] = [
+    pub const ALL: [Self; 12] = [
         Self::CameraInfo,
         Self::Clock,
         Self::CompressedImage,
         Self::Detection3dArray,
         Self::DiagnosticArray,
+        Self::Imu,
         Self::MarkerArray,
         Self::Odometry,
         Self::PointCloud2,
         Self::PoseWithCovarianceStamped,
         Self::TfMessage,
+        Self::TwistStamped,
     ];
 
     /// Name in ROS 2: `sensor_msgs/msg/PointCloud2`.
@@ -111,6 +117,7 @@ impl RosType {
             Self::DiagnosticArray => {
                 (&of::DIAGNOSTIC_ARRAY, &[of::HEADER, of::TIME, of::DIAGNOSTIC_STATUS, of::KEY_VALUE])
             }
+            Self::Imu => (&of::IMU, &[of::HEADER, of::TIME, of::QUATERNION, of::VECTOR]),
             Self::MarkerArray => (
                 &of::MARKER_ARRAY,
                 &[
@@ -151,6 +158,7 @@ impl RosType {
                 &of::TF_MESSAGE,
                 &[of::TRANSFORM_STAMPED, of::HEADER, of::TIME, of::TRANSFORM, of::VECTOR, of::QUATERNION],
             ),
+            Self::TwistStamped => (&of::TWIST_STAMPED, &[of::HEADER, of::TIME, of::TWIST, of::VECTOR]),
         }
     }
 }
@@ -189,11 +197,13 @@ mod tests {
             (RosType::CompressedImage, "15640771531571185e2efc8a100baf923961a4d15d5569652e6cb6691e8e371a"),
             (RosType::Detection3dArray, "793f5eab9595ac1c0da07873cc859db42eae51f0ee76056db8562515d830e018"),
             (RosType::DiagnosticArray, "5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e"),
+            (RosType::Imu, "7d9a00ff131080897a5ec7e26e315954b8eae3353c3f995c55faf71574000b5b"),
             (RosType::MarkerArray, "86cb8800b6fb05b5eff1abd7a56f62a5641d3ae9a1c29e78e67e704f1d067dcf"),
             (RosType::Odometry, "3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0"),
             (RosType::PointCloud2, "9198cabf7da3796ae6fe19c4cb3bdd3525492988c70522628af5daa124bae2b5"),
             (RosType::PoseWithCovarianceStamped, "26432f9803e43727d3c8f668d1fdb3c630f548af631e2f4e31382371bfea3b6e"),
             (RosType::TfMessage, "e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"),
+            (RosType::TwistStamped, "5f0fcd4f81d5d06ad9b4c4c63e3ea51b82d6ae4d0558f1d475229b1121db6f64"),
         ];
         assert_eq!(known.map(|(ros_type, _)| ros_type), RosType::ALL);
         for (ros_type, hash) in known {

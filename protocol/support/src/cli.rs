@@ -1,4 +1,4 @@
-//! Exit of a program: printed errors, and the exit codes 0 to 3.
+//! Exit of a program: printed errors, and the exit codes 0 to 3 and 130.
 
 use std::error::Error;
 use std::fmt::{Debug, Display};
@@ -21,6 +21,16 @@ impl BadInput {
     pub fn new(message: impl Display + Debug + Send + Sync + 'static) -> Self {
         Self(anyhow::Error::msg(message))
     }
+}
+
+/// Cause of an end on request (Ctrl-C): exit code 130. The error above it states what is kept; it is printed as a note.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error("stopped")]
+pub struct Interrupted;
+
+impl Interrupted {
+    /// Exit code: 128 and the number of SIGINT, as of a shell.
+    pub const EXIT_CODE: u8 = 130;
 }
 
 /// Outcome of a command that did not fail.
@@ -56,6 +66,10 @@ pub fn exit_code(result: anyhow::Result<Outcome>, is_bad_input: impl Fn(&(dyn Er
         Ok(Outcome::Done) => ExitCode::SUCCESS,
         Ok(Outcome::BadInput) => ExitCode::from(2),
         Ok(Outcome::DataLost) => ExitCode::from(3),
+        Err(error) if error.chain().any(|cause| cause.is::<Interrupted>()) => {
+            output::note(chain_of(&error));
+            ExitCode::from(Interrupted::EXIT_CODE)
+        }
         Err(error) => {
             output::error(chain_of(&error));
             let is_bad = error.chain().any(|cause| cause.is::<BadInput>() || is_bad_input(cause));
@@ -87,12 +101,13 @@ mod tests {
     }
 
     #[test]
-    fn exit_codes_are_0_to_3() {
+    fn exit_codes_are_0_to_3_and_130() {
         for (outcome, code) in [(Outcome::Done, 0), (Outcome::BadInput, 2), (Outcome::DataLost, 3)] {
             assert_eq!(code_of(Ok(outcome)), ExitCode::from(code));
         }
         assert_eq!((Outcome::of(false), Outcome::of(true)), (Outcome::Done, Outcome::DataLost));
         assert_eq!(code_of(Err(anyhow::anyhow!("broken"))), ExitCode::from(1));
+        assert_eq!(code_of(Err(anyhow::anyhow!(Interrupted).context("stopped at step 3"))), ExitCode::from(130));
         let bad: anyhow::Result<Outcome> = Err(BadInput::new("--frames is 0").into());
         assert_eq!(code_of(bad.context("reading")), ExitCode::from(2));
         let bad = "x".parse::<i32>().context("--frames").map(|_| Outcome::Done);

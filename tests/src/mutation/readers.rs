@@ -11,7 +11,7 @@ use localization::pose_source::{ErrorTable, PoseTable};
 use perception::weights::Weights;
 use protocol::{Limits, wire};
 use recording::Recording;
-use ros2::{SweepLimits, read_point_cloud};
+use ros2::{MotionType, SweepLimits, read_point_cloud};
 use runner::experiment::sweep::Experiment;
 use runner::experiment::table::TableSpec;
 use runner::scenario::Scenario;
@@ -65,6 +65,12 @@ pub fn all(root: &Path) -> Vec<Reader> {
         in_memory("pcd", seeds::clouds(), |_, bytes| pcd::decode(bytes).is_ok()),
         in_memory("ros2 cloud", vec![seeds::ros2_cloud()], |_, bytes| {
             read_point_cloud(bytes, SweepLimits { max_points: 1 << 20, max_abs_value: 1e6 }).is_ok()
+        }),
+        in_memory("ros2 motion", seeds::ros2_motions(), |_, bytes| {
+            // One byte in front selects the type.
+            let Some((first, message)) = bytes.split_first() else { return false };
+            let types = [MotionType::Odometry, MotionType::TwistStamped, MotionType::Imu];
+            types[usize::from(*first) % types.len()].read(message).is_ok()
         }),
         on_disk("ply", vec![seeds::PLY.as_bytes().to_vec()], file("ply", "a.ply"), read_cloud),
         on_disk("npy", vec![seeds::npy()], file("npy", "a.npy"), read_cloud),

@@ -95,6 +95,28 @@ pub fn ros2_cloud() -> Vec<u8> {
     translator.translate(&topic, 1_500_000_000, &message).remove(0).cdr
 }
 
+/// A motion as `nav_msgs/Odometry`, `geometry_msgs/TwistStamped` and `sensor_msgs/Imu`, each behind a byte with the number
+/// of its type.
+#[must_use]
+pub fn ros2_motions() -> Vec<Vec<u8>> {
+    let text = |text: &str| [&(text.len() as u32 + 1).to_le_bytes(), text.as_bytes(), &[0]].concat();
+    let message = |number: u8, texts: &[&str], values: &[f64]| {
+        let mut body = [7_u32, 8].map(u32::to_le_bytes).concat();
+        for value in texts {
+            body.resize(body.len().next_multiple_of(4), 0);
+            body.extend(text(value));
+        }
+        body.resize(body.len().next_multiple_of(8), 0);
+        body.extend(values.iter().flat_map(|value| value.to_le_bytes()));
+        [&[number, 0, 1, 0, 0][..], &body].concat()
+    };
+    vec![
+        message(0, &["odom", "base_link"], &[0.5; 7 + 36 + 6 + 36]),
+        message(1, &["base_link"], &[0.5; 6]),
+        message(2, &["imu_link"], &[0.5; 4 + 9 + 3 + 9 + 3 + 9]),
+    ]
+}
+
 /// A recording of a message of every kind.
 ///
 /// # Panics

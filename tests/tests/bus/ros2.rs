@@ -8,14 +8,14 @@ use std::time::{Duration, Instant};
 use bus::bounded_queue::Pop;
 use bus::shutdown::Stop;
 use bus::{Bus, BusOptions, Event, PublisherOptions};
-use deploy::ros::{NodeOptions, NodeReport, RosSession, run};
+use deploy::ros::{MotionSource, NodeOptions, NodeReport, RosSession, run};
 use protocol::{
     Box3d, CavId, Detection, Detections, EgoMotion, Lidar, Limits, PlanarCovariance, PointCloud, Pose, PoseEstimate,
     Role, Stream, Topic,
 };
 use re_cdr::{CdrReader, CdrWriter, LittleEndian};
 use ros2::endpoint::Attachment;
-use ros2::{Distribution, RosType};
+use ros2::{Distribution, MotionType, RosType};
 use tests::bus::{TIMEOUT, TestRouter, next_event, wait_for};
 use zenoh::liveliness::LivelinessToken;
 use zenoh::{Session, Wait};
@@ -281,6 +281,37 @@ fn driver_cloud(nanos: u64, point_step: u32) -> Vec<u8> {
     bytes
 }
 
+/// `nav_msgs/Odometry` of a robot that drives so.
+fn odometry(nanos: u64, speed_mps: f64, yaw_rate_rad_s: f64) -> Vec<u8> {
+    with_header(nanos, &["odom", "base_link"], |values| {
+        values.extend([0.0; 7 + 36]);
+        values.extend([speed_mps, 0.0, 0.0, 0.0, 0.0, yaw_rate_rad_s]);
+        values.extend([0.01; 36]);
+    })
+}
+
+/// `sensor_msgs/Imu` of a robot that turns so.
+fn imu(nanos: u64, yaw_rate_rad_s: f64) -> Vec<u8> {
+    with_header(nanos, &["imu_link"], |values| {
+        values.extend([0.0; 4 + 9]);
+        values.extend([0.0, 0.0, yaw_rate_rad_s]);
+        values.extend([0.01; 9]);
+        values.extend([0.0; 3 + 9]);
+    })
+}
+
+fn with_header(nanos: u64, texts: &[&str], fill: impl FnOnce(&mut Vec<f64>)) -> Vec<u8> {
+    let mut bytes = vec![0, 1, 0, 0];
+    let mut cdr = CdrWriter::<LittleEndian>::new(&mut bytes);
+    cdr.write_i32((nanos / 1_000_000_000) as i32);
+    cdr.write_u32((nanos % 1_000_000_000) as u32);
+    texts.iter().for_each(|text| cdr.write_string(text));
+    let mut values = Vec::new();
+    fill(&mut values);
+    values.into_iter().for_each(|value| cdr.write_f64(value));
+    bytes
+}
+
 fn announce(session: &Session) -> LivelinessToken {
     let zid = session.zid();
     let token = format!("@ros2_lv/{DOMAIN}/{zid}/0/0/NN/%/%/driver");
@@ -333,4 +364,58 @@ fn a_lidar_of_ros_is_that_of_an_agent_and_a_wrong_message_is_counted() {
             while !matches!(next_event(&inbox), (_, Event::End { .. })) {}
         });
     }
+}
+
+#[test]
+fn the_odometry_of_a_robot_is_the_motion_of_its_agent_at_every_sweep() {
+    let (router, stop) = (TestRouter::open(), Stop::new());
+    let agent = router.join("agent-1000", "1000");
+    let inbox = agent.inbox(4, 1);
+    let _subscription = agent.subscribe(topic(Stream::Imu), &inbox).unwrap();
+    std::thread::scope(|scope| {
+        let of = |motion_type, topic: &str| MotionSource { motion_type, source: topic.parse().unwrap() };
+        let motions = vec![of(MotionType::Odometry, "/odom=1000"), of(MotionType::Imu, "/imu=1000")];
+        let lidars = vec!["/points=1000".parse().unwrap()];
+        let options = NodeOptions { lidars, motions, ..NodeOptions::default() };
+        let node = start(scope, &router, (Distribution::Jazzy, options), &stop);
+        let robot = other_node(&router);
+        let _node = announce(&robot);
+        wait_for("the subscriptions", || {
+            let tokens = tokens(&robot, &format!("@ros2_lv/{DOMAIN}/*/0/*/MS/**"));
+            ["/%points/", "/%odom/", "/%imu/"].iter().all(|topic| tokens.iter().any(|token| token.contains(topic)))
+        });
+        let put = |topic: &str, ros_type: RosType, message: Vec<u8>| {
+            let attachment = Attachment { sequence: 1, source_nanos: 1, gid: [7; 16] };
+            let key = key(topic, &ros_type.dds_name(), &ros_type.hash(Distribution::Jazzy));
+            robot.put(key, message).attachment(attachment.to_bytes()).wait().unwrap();
+        };
+        let mut sent = 0;
+        let arrival = loop {
+            sent += 1;
+            // Half-way between two measurements; the gyroscope's yaw rate replaces that of the wheels.
+            let sweep = AT + sent * 1_000_000_000;
+            for (nanos, speed_mps) in [(sweep - 50_000_000, 4.0), (sweep + 50_000_000, 6.0)] {
+                put("odom", RosType::Odometry, odometry(nanos, speed_mps, 3.0));
+                put("imu", RosType::Imu, imu(nanos, -0.5));
+            }
+            put("odom", RosType::Odometry, odometry(sweep + 60_000_000, f64::NAN, 0.0));
+            put("points", RosType::PointCloud2, driver_cloud(sweep, 16));
+            match inbox.take(Some(Instant::now() + Duration::from_millis(100))) {
+                Pop::Item(_, Event::Message(arrival)) => break arrival,
+                Pop::Item(..) | Pop::TimedOut => assert!(sent < 600, "nothing arrives"),
+                Pop::Closed => panic!("the inbox is closed"),
+            }
+        };
+        let capture = arrival.header.stamp.capture_nanos;
+        assert!(capture > AT && (capture - AT) % 1_000_000_000 == 0, "the time of a sweep, {capture}");
+        let motion: EgoMotion = inbox.decode(&arrival, &Limits::DEFAULT).unwrap();
+        let (speed_mps, yaw_rate_rad_s) = (motion.speed_mps.unwrap(), motion.yaw_rate_rad_s.unwrap());
+        assert!((speed_mps - 5.0).abs() < 1e-9 && (yaw_rate_rad_s + 0.5).abs() < 1e-9, "{motion:?}");
+        stop.request();
+        let report = node.join().unwrap();
+        let [odom, imu] = ["/odom", "/imu"].map(|topic| report.motion[topic]);
+        assert!(odom.read >= 2 && odom.unreadable >= 1 && imu.read >= 2 && imu.unreadable == 0, "{report:?}");
+        assert!(!report.is_complete() && report.lidar.is_complete(), "{report:?}");
+        while !matches!(next_event(&inbox), (_, Event::End { .. })) {}
+    });
 }

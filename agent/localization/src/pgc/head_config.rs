@@ -36,6 +36,10 @@ pub struct SceneHeadConfig {
     pub max_cells: usize,
     /// Pose refinement; `None` for none.
     pub refiner: Option<RefinerConfig>,
+    /// Median number of points within the encoder's range in the sweeps that it was trained on; `None` where it was not
+    /// counted. Clouds of another LiDAR have another number.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub sweep_points: Option<usize>,
 }
 
 /// Configuration of the refiner of a head.
@@ -195,6 +199,7 @@ mod tests {
             origin_m: [0.0; 3],
             max_cells: 1024,
             refiner: None,
+            sweep_points: None,
         };
         assert_eq!(head.validate(), Ok(()));
         let message = SceneHeadConfig { width: 16_384, blocks: 16_384, ..head }.validate().unwrap_err();

@@ -1,10 +1,14 @@
-//! Hint for a run in which no sweep was localized: the head may be of another place.
+//! Hints for sweeps that were not localized: the head may be of another place, or of another LiDAR.
 
 use std::path::Path;
 
 use perception::weights::Weights;
 
 use super::head_config::SceneHeadConfig;
+
+/// Smallest ratio of numbers of points, and the inverse of the largest, at which sweeps count as those of one LiDAR: the
+/// numbers of one in a street and on a square differ by less.
+const LEAST_RATIO: f64 = 0.6;
 
 /// The hint, with the place in the head's metadata and the map of the scene, as far as they are known.
 #[must_use]
@@ -14,6 +18,22 @@ pub fn wrong_place_hint(sweeps: u64, head: &Path, scene_map: Option<&str>) -> St
     hint(sweeps, &head.display().to_string(), place.as_deref(), scene_map)
 }
 
+/// The hint that sweeps without a pose are those of another LiDAR, if their median number of points is far from that of
+/// the sweeps that the head was made from ([`SceneHeadConfig::sweep_points`]).
+#[must_use]
+pub fn other_lidar_hint(head_points: Option<usize>, points: &[usize]) -> Option<String> {
+    let mut points = points.to_vec();
+    points.sort_unstable();
+    let (own, of_head) = (*points.get(points.len() / 2)?, head_points?);
+    let ratio = own as f64 / of_head.max(1) as f64;
+    (!(LEAST_RATIO..=1.0 / LEAST_RATIO).contains(&ratio)).then(|| {
+        format!(
+            "sweeps without a pose have {own} points (median), those that the head was made from {of_head}: another LiDAR \
+             needs a head of its own (agent map)"
+        )
+    })
+}
+
 fn hint(sweeps: u64, head: &str, place: Option<&str>, scene_map: Option<&str>) -> String {
     let known = match (place, scene_map) {
         (Some(place), Some(map)) => format!(" It is of {place}, the scene is of {map}"),
@@ -21,7 +41,7 @@ fn hint(sweeps: u64, head: &str, place: Option<&str>, scene_map: Option<&str>) -
         (None, Some(map)) => format!(" The scene is of {map}"),
         (None, None) => String::new(),
     };
-    format!("no vehicle found itself in {sweeps} sweeps: is {head} the head of this place?{known}")
+    format!("no vehicle found itself in {sweeps} sweeps: is {head} the head of this place and this LiDAR?{known}")
 }
 
 #[cfg(test)]
@@ -31,10 +51,22 @@ mod tests {
     #[test]
     fn the_places_of_head_and_scene_are_named_as_far_as_they_are_known() {
         let text = hint(10, "pgc-town1.safetensors", Some("town1"), Some("town4:0"));
-        let expected = "no vehicle found itself in 10 sweeps: is pgc-town1.safetensors the head of this place? It is of \
-                        town1, the scene is of town4:0";
+        let expected = "no vehicle found itself in 10 sweeps: is pgc-town1.safetensors the head of this place and this \
+                        LiDAR? It is of town1, the scene is of town4:0";
         assert_eq!(text, expected);
         assert!(hint(10, "h", Some("town1"), None).ends_with("? It is of town1"));
-        assert!(wrong_place_hint(3, Path::new("/no/head"), None).ends_with("is /no/head the head of this place?"));
+        assert!(
+            wrong_place_hint(3, Path::new("/no/head"), None)
+                .ends_with("is /no/head the head of this place and this LiDAR?")
+        );
+    }
+
+    #[test]
+    fn sweeps_of_another_density_are_named_with_both_numbers() {
+        let hint = |own: &[usize], of_head| other_lidar_hint(of_head, own);
+        let text = hint(&[21_000, 22_000, 400], Some(57_000)).unwrap();
+        assert!(text.contains("21000 points") && text.contains("57000"), "{text}");
+        assert!(hint(&[150_000], Some(57_000)).is_some());
+        assert_eq!([hint(&[40_000], Some(57_000)), hint(&[], Some(57_000)), hint(&[9], None)], [None, None, None]);
     }
 }

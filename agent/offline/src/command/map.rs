@@ -8,7 +8,7 @@ use agent_offline::mapping::{MapConfig, MapError, MapProgress, MapReport, make_m
 use anyhow::Context;
 use bus::malloc_settings;
 use perception::compute_device::ComputeDevice;
-use perception::train::{ComputePrecision, Length, ModelCard, OptionsError, RunConfig, TrainingBar};
+use perception::train::{ComputePrecision, Interruption, Length, ModelCard, RunConfig, TrainingBar, check_out};
 use support::cli::{BadInput, Outcome};
 use support::output;
 
@@ -53,8 +53,11 @@ pub(crate) struct Args {
     /// Threads of the network on the CPU [default: half as many as cores].
     #[arg(long, value_parser = clap::value_parser!(u16).range(1..=256))]
     threads: Option<u16>,
-    /// Overwrite the map in --out.
+    /// Go on with the map in --out that Ctrl-C has stopped; sweeps are encoded again.
     #[arg(long)]
+    resume: bool,
+    /// Overwrite the map in --out.
+    #[arg(long, conflicts_with = "resume")]
     force: bool,
     /// Print the report as JSON.
     #[arg(long)]
@@ -95,10 +98,7 @@ impl Args {
         check_folders(&self.drives)?;
         let time = Duration::try_from_secs_f64(60.0 * self.minutes).ok().filter(|time| !time.is_zero());
         let time = time.ok_or_else(|| BadInput::new(format!("--minutes is {}, must be above 0", self.minutes)))?;
-        let weights = self.out.join("weights.safetensors");
-        if weights.exists() && !self.force {
-            return Err(BadInput::of(OptionsError::Trained(weights)).into());
-        }
+        check_out(&self.out, self.resume, self.force).map_err(BadInput::of)?;
         let missing = || BadInput::new("no released encoder is found: --encoder FILE");
         let encoder = self.encoder.clone().or_else(released_encoder).ok_or_else(missing)?;
         let cores = std::thread::available_parallelism().map_or(1, usize::from);
@@ -117,6 +117,8 @@ impl Args {
                 device,
                 precision: ComputePrecision::fastest_on(device),
                 loader_threads: (threads / 2).max(1),
+                resume: self.resume,
+                interruption: Interruption::by_signals().context("cannot catch Ctrl-C")?,
                 command: std::env::args().collect::<Vec<_>>().join(" "),
                 ..RunConfig::new(Length::Time(time), &self.out)
             },

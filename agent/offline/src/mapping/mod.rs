@@ -16,7 +16,7 @@ pub use coverage::{Coverage, CoveredCell};
 pub use report::{HeldOutAccuracy, MapReport};
 
 use self::check::Check;
-use self::plan::{Plan, feature_bytes, too_little_memory};
+use self::plan::{Plan, StoredPlan, feature_bytes, too_little_memory};
 use crate::evaluation::LocalizationSummary;
 use crate::head_files::ENCODER_FILE;
 use crate::training::{
@@ -56,7 +56,7 @@ pub struct MapConfig {
     pub time: Duration,
     /// Largest number of training sweeps.
     pub most_sweeps: Option<usize>,
-    /// Folder, device, precision, threads and seed; its length is not used.
+    /// Folder, device, precision, threads and seed, true to resume; its length is not used.
     pub run: RunConfig,
 }
 
@@ -92,6 +92,14 @@ pub enum MapError {
         /// Bytes available.
         free: u64,
     },
+    /// The folder of the results holds no stopped map of these drives.
+    #[error("--resume: {}: {reason}", path.display())]
+    Resume {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it.
+        reason: String,
+    },
     /// A training failed, or data cannot be read.
     #[error(transparent)]
     Training(#[from] LocalizerTrainError),
@@ -116,7 +124,7 @@ impl MapError {
     #[must_use]
     pub fn is_bad_input(&self) -> bool {
         match self {
-            Self::NoPoses { .. } | Self::Memory { .. } => true,
+            Self::NoPoses { .. } | Self::Memory { .. } | Self::Resume { .. } => true,
             Self::Training(error) => matches!(error, LocalizerTrainError::Read(_) | LocalizerTrainError::NoSweeps(_)),
             Self::Localizer(_) | Self::Weights(_) | Self::Io { .. } => false,
         }
@@ -242,9 +250,19 @@ impl Map<'_> {
         Ok(Sweeps { list, positions, training, held_out: held, without_pose })
     }
 
-    /// Measures the time of a sweep, plans and announces.
+    /// Measures the time of a sweep, plans and announces; or takes the plan of the map that is resumed.
     fn plan(&mut self, sweeps: &Sweeps) -> Result<Plan, MapError> {
         let run = &self.config.run;
+        let with_pose = sweeps.training.len() + sweeps.held_out.len();
+        if run.resume {
+            let plan = StoredPlan::read(&run.out, with_pose)?;
+            let Plan { training, copies, encoding_s, .. } = plan;
+            let encoded = training * copies;
+            self.note(format!(
+                "resuming: {encoded} sweeps are encoded again, in {encoding_s:.0} s, before the training"
+            ));
+            return Ok(plan);
+        }
         let (encoder, _) = SceneEncoder::load(&self.config.encoder, run.device)?;
         let wanted = self.config.most_sweeps.unwrap_or(usize::MAX).min(sweeps.training.len());
         let probes = Arc::new(sweeps.list.subset(&thinned(&sweeps.training, PROBES)));
@@ -275,6 +293,7 @@ impl Map<'_> {
             return Err(MapError::Memory { sweeps: encoded, needed, free });
         }
         self.announce(sweeps, &plan, wanted);
+        StoredPlan { sweeps: with_pose, plan }.write(&run.out)?;
         Ok(plan)
     }
 
@@ -326,18 +345,24 @@ impl Map<'_> {
         let sweeps = SceneSweeps { training: Arc::clone(training), validation: None };
         let started = self.started;
         let observe = &mut *self.observe;
+        let training_end_s = self.config.time.as_secs_f64() - plan.check_s;
+        let mut steps_began_s = None;
         let mut tell = |report: &SceneReport| {
+            let mut seconds = started.elapsed().as_secs_f64();
             let text = match report {
                 SceneReport::Encoding(done, total) => format!("encoding, {done} of {total} sweeps"),
                 SceneReport::Classified(share) => {
                     format!("{:.0} % of the sweeps are assigned to their part of the place", 100.0 * share)
                 }
-                SceneReport::Stepped { step, error_m, refined_m, .. } => {
+                SceneReport::Stepped { step, share_done, error_m, refined_m, .. } => {
+                    // A resumed training has a part behind it.
+                    let began_s: f64 = *steps_began_s.get_or_insert(seconds);
+                    seconds = began_s + share_done * (training_end_s - began_s).max(0.0);
                     format!("training, step {step}, error of cells {error_m:.2} m, refined {refined_m:.2} m")
                 }
                 SceneReport::Encoded(_) | SceneReport::Validated(..) => return,
             };
-            observe(MapProgress::At(started.elapsed().as_secs_f64(), text));
+            observe(MapProgress::At(seconds, text));
         };
         Ok((train_scene_on(&config, &sweeps, &mut tell)?, run))
     }

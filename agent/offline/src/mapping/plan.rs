@@ -1,7 +1,12 @@
 //! Plan of a map: number of sweeps and time of each part, from the measured time of one sweep and the time there is.
 
 use std::fs;
+use std::path::Path;
 
+use serde::{Deserialize, Serialize};
+use support::atomic_file;
+
+use super::MapError;
 use super::check::LEAST_CHECKED;
 use crate::training::CELLS;
 
@@ -19,7 +24,8 @@ const ENOUGH_SWEEPS: usize = 150;
 const MEMORY_SHARE: f64 = 0.7;
 
 /// Sweeps and times of a map.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub(super) struct Plan {
     /// Number of training sweeps.
     pub(super) training: usize,
@@ -47,6 +53,41 @@ impl Plan {
         let copies = copies.min((affordable / training.max(1)).max(1));
         let training = training.min(affordable.max(1));
         Self { training, copies, checked, encoding_s: (training * copies) as f64 * sweep_s, check_s }
+    }
+}
+
+/// A plan and the data that it is for, in the folder of the results: the measured time of a sweep differs from run to run,
+/// and a resumed map needs the sweeps of the stopped one.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct StoredPlan {
+    /// Number of sweeps with a pose, before any is left out.
+    pub(super) sweeps: usize,
+    /// The plan.
+    pub(super) plan: Plan,
+}
+
+impl StoredPlan {
+    /// Name of the file.
+    const FILE: &str = "plan.json";
+
+    pub(super) fn write(&self, out: &Path) -> Result<(), MapError> {
+        let path = out.join(Self::FILE);
+        let text = serde_json::to_string(self).expect("a plan is numbers");
+        let written = fs::create_dir_all(out).and_then(|()| atomic_file::write(&path, text.as_bytes()));
+        written.map_err(|source| MapError::Io { path, source })
+    }
+
+    /// The plan of a stopped map of `sweeps` sweeps.
+    pub(super) fn read(out: &Path, sweeps: usize) -> Result<Plan, MapError> {
+        let path = out.join(Self::FILE);
+        let wrong = |reason: String| MapError::Resume { path: path.clone(), reason };
+        let text = fs::read_to_string(&path).map_err(|error| wrong(error.to_string()))?;
+        let stored: Self = serde_json::from_str(&text).map_err(|error| wrong(error.to_string()))?;
+        if stored.sweeps != sweeps {
+            return Err(wrong(format!("the stopped map was of {} sweeps, the drives have {sweeps}", stored.sweeps)));
+        }
+        Ok(stored.plan)
     }
 }
 
@@ -85,6 +126,17 @@ mod tests {
         let plan = Plan::new(3, 1, 0.1, 600.0);
         assert_eq!((plan.training, plan.copies, plan.checked), (3, 40, 1));
         assert!(Plan::new(3, 1, 10.0, 60.0).copies <= 2);
+    }
+
+    #[test]
+    fn a_plan_is_read_back_for_the_same_sweeps_only() {
+        let folder = tempfile::tempdir().unwrap();
+        let reason = |sweeps| StoredPlan::read(folder.path(), sweeps).unwrap_err().to_string();
+        assert!(reason(680).contains("plan.json"));
+        let plan = Plan::new(600, 80, 0.1, 600.0);
+        StoredPlan { sweeps: 680, plan }.write(folder.path()).unwrap();
+        assert_eq!(StoredPlan::read(folder.path(), 680).unwrap(), plan);
+        assert!(reason(681).contains("of 680 sweeps, the drives have 681"), "{}", reason(681));
     }
 
     #[test]

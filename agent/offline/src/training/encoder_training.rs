@@ -97,6 +97,7 @@ pub fn train_encoder(
     let mut window = Window::default();
     while training.share_done() < 1.0 {
         training.step(&loader.next_batch()??, &mut window)?;
+        training.trainer.check_interruption(&training.variables)?;
         let step = training.trainer.steps();
         if step.is_multiple_of(REPORT_EVERY) {
             observe(&training.report(std::mem::take(&mut window))?);

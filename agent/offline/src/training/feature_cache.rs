@@ -41,6 +41,8 @@ pub(crate) struct FeatureCache {
     pub sensor_m: Tensor,
     /// `[S, sweep_channels]`, single precision.
     pub sweeps: Tensor,
+    /// `[S]`: number of points within the range of the encoder.
+    pub points: Vec<usize>,
     /// `[S]`: true poses.
     pub world_from_sensor: Vec<Isometry3<f64>>,
     /// Origin of the targets, metres in the world: the centre of the sensor positions, if no other was set.
@@ -128,13 +130,21 @@ struct Builder {
     sweeps: Vec<Tensor>,
     sweep_of_cell: Vec<i64>,
     places: Vec<Cell>,
+    points: Vec<usize>,
     poses: Vec<Isometry3<f64>>,
 }
 
 impl Builder {
     fn new(rows: i64, channels: i64, device: Device) -> Result<Self, TchError> {
         let cells = Tensor::f_empty([rows, channels], (Kind::Half, device))?;
-        Ok(Self { cells, sweeps: Vec::new(), sweep_of_cell: Vec::new(), places: Vec::new(), poses: Vec::new() })
+        Ok(Self {
+            cells,
+            sweeps: Vec::new(),
+            sweep_of_cell: Vec::new(),
+            places: Vec::new(),
+            points: Vec::new(),
+            poses: Vec::new(),
+        })
     }
 
     fn add(
@@ -154,6 +164,7 @@ impl Builder {
             rows.extend(prepared.rows.iter().map(|&row| first + row as i64));
             self.sweep_of_cell.extend(prepared.rows.iter().map(|_| (self.poses.len()) as i64));
             self.places.extend(prepared.rows.iter().map(|&row| prepared.voxels.cells()[row]));
+            self.points.push(prepared.points);
             self.poses.push(prepared.world_from_sensor);
         }
         let rows = Tensor::f_from_slice(&rows)?.f_to_device(device)?;
@@ -187,6 +198,7 @@ impl Builder {
             targets_m: columns(&targets)?,
             sensor_m: columns(&sensor)?,
             sweeps: Tensor::f_cat(&self.sweeps, 0)?,
+            points: self.points,
             world_from_sensor: self.poses,
             origin_m,
         })

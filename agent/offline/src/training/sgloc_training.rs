@@ -90,6 +90,7 @@ pub fn train_sgloc(
         let loss = coordinate_loss(&network, &cache, &rows)?;
         window.push(loss.f_double_value(&[])?);
         trainer.step(&loss, share_done(&trainer))?;
+        trainer.check_interruption(&variables)?;
         let step = trainer.steps();
         if step.is_multiple_of(REPORT_EVERY) {
             let error_m = window.iter().sum::<f64>() / window.len() as f64;

@@ -15,6 +15,8 @@ pub(super) struct TurnedSweep {
     pub(super) voxels: SweepVoxels,
     /// Indices of the cells that are training examples.
     pub(super) rows: Vec<usize>,
+    /// Number of points within the range of the encoder, before any is left out.
+    pub(super) points: usize,
     /// Pose of the turned sensor.
     pub(super) world_from_sensor: Isometry3<f64>,
 }
@@ -30,6 +32,7 @@ impl TurnedSweep {
     ) -> Self {
         let voxels = stored.turned_voxels(turned_from_sensor, keep, rng, config);
         let rows = choose(voxels.cells(), CELLS, rng);
-        Self { voxels, rows, world_from_sensor: stored.world_from_sensor * turned_from_sensor.inverse() }
+        let world_from_sensor = stored.world_from_sensor * turned_from_sensor.inverse();
+        Self { voxels, rows, points: stored.point_count(), world_from_sensor }
     }
 }

@@ -3,6 +3,7 @@
 use std::io;
 use std::path::PathBuf;
 
+use support::cli::Interrupted;
 use tch::TchError;
 
 use super::checkpoint::CheckpointError;
@@ -12,6 +13,9 @@ use crate::weights::WeightsError;
 /// Error that ends a training early.
 #[derive(Debug, thiserror::Error)]
 pub enum TrainingError {
+    /// Ended on request after so many steps; the checkpoint is written.
+    #[error("stopped at step {0}; --resume goes on")]
+    Interrupted(u64, #[source] Interrupted),
     /// The checkpoint cannot be written or restored.
     #[error(transparent)]
     Checkpoint(#[from] CheckpointError),

@@ -1,14 +1,15 @@
 //! Command-line options that all trainings share.
 
 use std::io;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use support::output;
 use tch::Device;
 
+use super::interruption::Interruption;
 use super::run_config::{ComputePrecision, Length, RunConfig};
-use super::trainer::Trained;
+use super::trainer::{CHECKPOINT_FILE, Trained};
 use crate::compute_device::{ComputeDevice, NoCuda};
 
 /// Options that are invalid for any training.
@@ -23,9 +24,15 @@ pub enum OptionsError {
     /// The folder of the results already holds a training.
     #[error("{}: it already holds a training; --resume continues it, --force overwrites it", .0.display())]
     Trained(PathBuf),
+    /// The folder of the results holds no checkpoint.
+    #[error("--resume: {} is missing: a training writes it now and then, and at Ctrl-C after its first step", .0.display())]
+    NoCheckpoint(PathBuf),
     /// There is no CUDA device.
     #[error("--device cuda: {0}")]
     NoCuda(#[from] NoCuda),
+    /// The signal handlers cannot be installed.
+    #[error("cannot catch Ctrl-C: {0}")]
+    Signals(String),
 }
 
 /// Options of length, device, precision and results.
@@ -70,8 +77,8 @@ pub struct TrainingOptions {
 }
 
 impl TrainingOptions {
-    /// The configuration of a training; also sets the tensor library's number of threads. Prints a line to standard
-    /// error if the CPU does not support the requested precision.
+    /// The configuration of a training; also sets the tensor library's number of threads, and makes Ctrl-C end the
+    /// training with a checkpoint. Prints a line to standard error if the CPU does not support the requested precision.
     ///
     /// # Errors
     /// [`OptionsError`] names the option that is invalid.
@@ -79,7 +86,7 @@ impl TrainingOptions {
         if batch == 0 {
             return Err(OptionsError::Batch);
         }
-        self.check_out()?;
+        check_out(&self.out, self.resume, self.force)?;
         tch::set_num_threads(i32::from(self.threads));
         let device = self.device.open()?;
         Ok(RunConfig {
@@ -90,6 +97,7 @@ impl TrainingOptions {
             precision: self.precision_on(device, has_bfloat16()),
             loader_threads: self.loader_threads,
             resume: self.resume,
+            interruption: Interruption::by_signals().map_err(|error| OptionsError::Signals(error.to_string()))?,
             command: std::env::args().collect::<Vec<_>>().join(" "),
             ..RunConfig::new(self.length()?, &self.out)
         })
@@ -113,15 +121,6 @@ impl TrainingOptions {
         }
     }
 
-    /// Rejects an existing training, unless overwriting is requested.
-    fn check_out(&self) -> Result<(), OptionsError> {
-        let files = ["weights.safetensors", "checkpoint.safetensors"].map(|name| self.out.join(name));
-        match files.into_iter().find(|file| file.exists()) {
-            Some(file) if !self.resume && !self.force => Err(OptionsError::Trained(file)),
-            _ => Ok(()),
-        }
-    }
-
     /// The number format of a device: bfloat16 without support in the CPU would take many times longer.
     fn precision_on(&self, device: Device, has_bfloat16: bool) -> ComputePrecision {
         if self.precision == ComputePrecision::Bf16 && device == Device::Cpu && !has_bfloat16 {
@@ -141,6 +140,21 @@ impl TrainingOptions {
             },
             _ => Err(OptionsError::Length),
         }
+    }
+}
+
+/// Rejects a folder of results with a training that is neither resumed nor overwritten, and one with nothing to resume.
+///
+/// # Errors
+/// [`OptionsError::Trained`] and [`OptionsError::NoCheckpoint`].
+pub fn check_out(out: &Path, resume: bool, force: bool) -> Result<(), OptionsError> {
+    let [weights, checkpoint] = ["weights.safetensors", CHECKPOINT_FILE].map(|name| out.join(name));
+    if resume {
+        return if checkpoint.exists() { Ok(()) } else { Err(OptionsError::NoCheckpoint(checkpoint)) };
+    }
+    match [weights, checkpoint].into_iter().find(|file| file.exists()) {
+        Some(file) if !force => Err(OptionsError::Trained(file)),
+        _ => Ok(()),
     }
 }
 
@@ -197,6 +211,8 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let line = |rest: &str| run_config(&format!("train --steps 3 --out {} {rest}", folder.path().display()), 4);
         assert!(line("").is_ok());
+        let checkpoint = folder.path().join("checkpoint.safetensors");
+        assert_eq!(line("--resume").unwrap_err(), OptionsError::NoCheckpoint(checkpoint));
         for name in ["checkpoint.safetensors", "weights.safetensors"] {
             let file = folder.path().join(name);
             std::fs::write(&file, b"").unwrap();

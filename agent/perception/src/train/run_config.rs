@@ -7,6 +7,7 @@ use tch::{Device, Kind};
 
 use super::adamw::AdamWConfig;
 use super::error::TrainingError;
+use super::interruption::Interruption;
 
 /// Configuration of a training run, for any network.
 #[derive(Debug, Clone)]
@@ -31,6 +32,8 @@ pub struct RunConfig {
     pub out: PathBuf,
     /// True to resume from the checkpoint in `out`.
     pub resume: bool,
+    /// Request to end early, with a checkpoint.
+    pub interruption: Interruption,
     /// The user's command line, for the model card.
     pub command: String,
 }
@@ -50,6 +53,7 @@ impl RunConfig {
             loader_threads: 1,
             out: out.to_owned(),
             resume: false,
+            interruption: Interruption::default(),
             command: String::new(),
         }
     }

@@ -6,6 +6,7 @@ use std::path::PathBuf;
 use std::time::Instant;
 
 use serde::{Deserialize, Serialize};
+use support::cli::Interrupted;
 use tch::Tensor;
 use tch::nn::VarStore;
 
@@ -14,10 +15,13 @@ use super::checkpoint;
 use super::curve::Curve;
 use super::data_listing::DataListing;
 use super::error::TrainingError;
+use super::interruption::Steps;
 use super::run_config::RunConfig;
 use super::schedule::OneCycle;
 use crate::weights;
 
+/// Name of the checkpoint in the folder of the results.
+pub(super) const CHECKPOINT_FILE: &str = "checkpoint.safetensors";
 /// Number of gradients in a row that are not finite after which a training fails.
 const MAX_SKIPPED: u32 = 20;
 
@@ -26,6 +30,9 @@ const MAX_SKIPPED: u32 = 20;
 struct Progress {
     step: u64,
     seconds: f64,
+    /// Of these, seconds before the first step of each run.
+    #[serde(default)]
+    preparing_seconds: f64,
     seed: u64,
     batch: usize,
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -74,6 +81,7 @@ pub struct Trainer {
     skipped: u32,
     started: Instant,
     seconds_before: f64,
+    steps: Steps,
 }
 
 impl Trainer {
@@ -89,15 +97,23 @@ impl Trainer {
         started: Instant,
     ) -> Result<Self, TrainingError> {
         let mut optimizer = AdamW::new(variables, run.optimizer);
-        let mut progress =
-            Progress { step: 0, seconds: 0.0, seed: run.seed, batch: run.batch, method: method.map(str::to_owned) };
+        let mut progress = Progress {
+            step: 0,
+            seconds: 0.0,
+            preparing_seconds: 0.0,
+            seed: run.seed,
+            batch: run.batch,
+            method: method.map(str::to_owned),
+        };
         if run.resume {
             let stored: Progress = checkpoint::restore(&checkpoint_path(run), variables, &mut optimizer)?;
             stored.check(&progress)?;
             progress = stored;
         }
         let seconds_before = progress.seconds;
-        Ok(Self { run: run.clone(), optimizer, progress, skipped: 0, started, seconds_before })
+        progress.preparing_seconds += started.elapsed().as_secs_f64();
+        let steps = run.interruption.steps();
+        Ok(Self { run: run.clone(), optimizer, progress, skipped: 0, started, seconds_before, steps })
     }
 
     /// Training curve, in `curve.csv` of the folder of the results.
@@ -119,6 +135,12 @@ impl Trainer {
     #[must_use]
     pub fn seconds(&self) -> f64 {
         self.seconds_before + self.started.elapsed().as_secs_f64()
+    }
+
+    /// Seconds spent on steps, in all runs together: without what came before the first step of each.
+    #[must_use]
+    pub fn seconds_of_steps(&self) -> f64 {
+        self.seconds() - self.progress.preparing_seconds
     }
 
     /// Share of the training that is done after `epoch` passes over the data, 0 at the start, 1 or more at the end.
@@ -158,6 +180,18 @@ impl Trainer {
         Ok(checkpoint::save(&checkpoint_path(&self.run), variables, &self.optimizer, &self.progress)?)
     }
 
+    /// Ends the training if that was requested; writes a checkpoint before. To be called after each step.
+    ///
+    /// # Errors
+    /// [`TrainingError::Interrupted`], or [`TrainingError::Checkpoint`].
+    pub fn check_interruption(&mut self, variables: &VarStore) -> Result<(), TrainingError> {
+        if !self.steps.is_interrupted() {
+            return Ok(());
+        }
+        self.checkpoint(variables)?;
+        Err(TrainingError::Interrupted(self.steps(), Interrupted))
+    }
+
     /// Writes the weights; their header contains `about`, their kind and training.
     ///
     /// # Errors
@@ -185,7 +219,7 @@ impl Trainer {
 }
 
 fn checkpoint_path(run: &RunConfig) -> PathBuf {
-    run.out.join("checkpoint.safetensors")
+    run.out.join(CHECKPOINT_FILE)
 }
 
 #[cfg(test)]

@@ -116,6 +116,7 @@ impl<'a> Training<'a> {
             let batch = loader.next_batch()??;
             window.waited += asked.elapsed();
             window.add(self.step(&batch)?);
+            self.trainer.check_interruption(&self.model.variables)?;
             if self.trainer.steps().is_multiple_of(READ_EVERY) {
                 let report = self.report(&mut window);
                 self.curve.step(&report)?;

@@ -192,7 +192,10 @@ fn a_wrong_message_is_named_with_field_and_values() {
     let error = read_point_cloud(&bytes[..bytes.len() - 10], LIMITS).unwrap_err().to_string();
     assert!(error.starts_with("data at byte "), "{error}");
     for bytes in [&[][..], &[0, 1], &[0, 3, 0, 0, 1], &[9; 40]] {
-        assert!(matches!(read_point_cloud(bytes, LIMITS), Err(PointCloudError::Encoding { .. })), "{bytes:?}");
+        assert!(
+            matches!(read_point_cloud(bytes, LIMITS), Err(PointCloudError::Message(ReadError::Encoding { .. }))),
+            "{bytes:?}"
+        );
     }
 }
 

@@ -6,7 +6,7 @@ use agent_offline::training::{DiffLocAccuracy, DiffLocReport, DiffLocTrainConfig
 use localization::baselines::diffloc::DiffLocConfig;
 use perception::train::{AdamWConfig, ModelCard, RunConfig, TrainingBar, TrainingOptions};
 
-use super::options::{bad, check_folders, print_left_out, run_config};
+use super::options::{SceneSweeps, bad, check_folders, print_left_out, run_config};
 
 /// Decoupled weight decay: sweeps are few beside the parameters.
 const WEIGHT_DECAY: f64 = 0.05;
@@ -17,15 +17,11 @@ const MAX_GRADIENT_NORM: f64 = 1.0;
 /// model-card.md.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Folders of sweeps, all of the same scene.
-    #[arg(long, required = true, num_args = 1.., value_name = "DIR")]
-    scenes: Vec<PathBuf>,
+    #[command(flatten)]
+    sweeps: SceneSweeps,
     /// Folders of sweeps of the same scene that are localized every 1000 steps.
     #[arg(long, num_args = 1.., value_name = "DIR")]
     validation: Vec<PathBuf>,
-    /// Name of the scene, for messages and the model card.
-    #[arg(long, default_value = "scene")]
-    scene_name: String,
     /// Sweeps per step, in windows of three.
     #[arg(long, default_value_t = 192)]
     batch: usize,
@@ -76,14 +72,14 @@ impl Args {
         if !(0.0..=10.0).contains(&self.shift) {
             return Err(bad(&format!("--shift is {}, must be 0 to 10 metres", self.shift)));
         }
-        check_folders(self.scenes.iter().chain(&self.validation))?;
+        check_folders(self.sweeps.scenes.iter().chain(&self.validation))?;
         let run = run_config(&self.options, self.batch, self.lr)?;
         let optimizer =
             AdamWConfig { weight_decay: WEIGHT_DECAY, max_gradient_norm: MAX_GRADIENT_NORM, ..run.optimizer };
         Ok(DiffLocTrainConfig {
-            scenes: self.scenes.clone(),
+            scenes: self.sweeps.scenes.clone(),
             validation: self.validation.clone(),
-            network: DiffLocConfig { scene_name: self.scene_name.clone(), ..DiffLocConfig::small() },
+            network: DiffLocConfig { scene_name: self.sweeps.scene_name.clone(), ..DiffLocConfig::small() },
             turn_rad: self.turn.to_radians(),
             shift_m: self.shift,
             run: RunConfig { optimizer, ..run },

@@ -1,23 +1,17 @@
 //! `agent train hypliloc`: arguments, progress and model card.
 
-use std::path::PathBuf;
-
 use agent_offline::training::{HypLiLocReport, HypLiLocTrainConfig, train_hypliloc};
 use perception::train::{ModelCard, TrainingBar, TrainingOptions};
 
-use super::options::{check_folders, print_left_out, run_config};
+use super::options::{SceneSweeps, check_folders, print_left_out, run_config};
 
 /// Train a small HypLiLoc on one scene; writes checkpoint, weights.safetensors and model-card.md.
 ///
 /// All inputs lie on the device: 50 kB for each sweep. A length in minutes begins when they are computed.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Folders of sweeps, all of the same scene.
-    #[arg(long, required = true, num_args = 1.., value_name = "DIR")]
-    scenes: Vec<PathBuf>,
-    /// Name of the scene, for messages and the model card.
-    #[arg(long, default_value = "scene")]
-    scene_name: String,
+    #[command(flatten)]
+    sweeps: SceneSweeps,
     /// Sweeps per step.
     #[arg(long, default_value_t = 128)]
     batch: usize,
@@ -29,10 +23,10 @@ pub(crate) struct Args {
 }
 
 pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
-    check_folders(&args.scenes)?;
+    check_folders(&args.sweeps.scenes)?;
     let config = HypLiLocTrainConfig {
-        scenes: args.scenes.clone(),
-        scene_name: args.scene_name.clone(),
+        scenes: args.sweeps.scenes.clone(),
+        scene_name: args.sweeps.scene_name.clone(),
         run: run_config(&args.options, args.batch, args.lr)?,
     };
     let bar = TrainingBar::of(config.run.length);

@@ -7,6 +7,17 @@ use perception::train::{DataListing, RunConfig, TrainingBar, TrainingOptions};
 
 use support::cli::BadInput;
 
+/// Sweeps of one scene, to learn from.
+#[derive(Debug, clap::Args)]
+pub(crate) struct SceneSweeps {
+    /// Folders of sweeps, all of the same scene.
+    #[arg(long, required = true, num_args = 1.., value_name = "DIR")]
+    pub(crate) scenes: Vec<PathBuf>,
+    /// Name of the scene, for messages and the model card.
+    #[arg(long, default_value = "scene")]
+    pub(crate) scene_name: String,
+}
+
 /// Error with exit code 2.
 pub(crate) fn bad(reason: &str) -> anyhow::Error {
     BadInput::new(reason.to_owned()).into()

@@ -8,15 +8,14 @@ use agent_offline::training::{
 };
 use perception::train::{ModelCard, TrainingBar, TrainingOptions};
 
-use super::options::{bad, check_folders, print_left_out, run_config};
+use super::options::{SceneSweeps, bad, check_folders, print_left_out, run_config};
 
 /// Train the head of one scene on the features of a frozen encoder; writes checkpoint, curve.csv, weights.safetensors
 /// and model-card.md.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Folders of sweeps, all of the same scene.
-    #[arg(long, required = true, num_args = 1.., value_name = "DIR")]
-    scenes: Vec<PathBuf>,
+    #[command(flatten)]
+    sweeps: SceneSweeps,
     /// Folders of other sweeps of the scene to validate on.
     #[arg(long, num_args = 1.., value_name = "DIR")]
     validation: Vec<PathBuf>,
@@ -33,9 +32,6 @@ pub(crate) struct Args {
     /// --classes, --centres, --width, --blocks and --no-refiner, its name --scene-name. Name sweeps that it knows among --scenes too.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["classes", "centres", "width", "blocks", "no_refiner", "scene_name"])]
     init: Option<PathBuf>,
-    /// Name of the scene, for messages and the model card.
-    #[arg(long, default_value = "scene")]
-    scene_name: String,
     /// Clusters of sensor positions that a sweep is classified into.
     #[arg(long, default_value_t = 50)]
     classes: i64,
@@ -113,15 +109,15 @@ impl Args {
         if self.copies == 0 || self.validation_sweeps == 0 {
             return Err(bad("--copies and --validation-sweeps must be above zero"));
         }
-        check_folders(self.scenes.iter().chain(&self.validation))?;
+        check_folders(self.sweeps.scenes.iter().chain(&self.validation))?;
         let run = run_config(&self.options, self.batch, self.lr)?;
         Ok(SceneTrainConfig {
-            scenes: self.scenes.clone(),
+            scenes: self.sweeps.scenes.clone(),
             validation: self.validation.clone(),
             validation_sweeps: self.validation_sweeps,
             encoder: self.encoder.clone(),
             init: self.init.clone(),
-            scene_name: self.scene_name.clone(),
+            scene_name: self.sweeps.scene_name.clone(),
             classes: self.classes,
             centres: self.centres,
             width: self.width,

@@ -5,17 +5,13 @@ use std::path::PathBuf;
 use agent_offline::training::{SgLocReport, SgLocTrainConfig, train_sgloc};
 use perception::train::{ModelCard, TrainingBar, TrainingOptions};
 
-use super::options::{check_folders, print_left_out, run_config};
+use super::options::{SceneSweeps, check_folders, print_left_out, run_config};
 
 /// Train SGLoc's head on one scene, on a frozen encoder; writes checkpoint, weights.safetensors and model-card.md.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Folders of sweeps, all of the same scene.
-    #[arg(long, required = true, num_args = 1.., value_name = "DIR")]
-    scenes: Vec<PathBuf>,
-    /// Name of the scene, for messages and the model card.
-    #[arg(long, default_value = "scene")]
-    scene_name: String,
+    #[command(flatten)]
+    sweeps: SceneSweeps,
     /// Weights of the frozen encoder, output of `agent train encoder`.
     #[arg(long, value_name = "FILE")]
     encoder: PathBuf,
@@ -30,10 +26,10 @@ pub(crate) struct Args {
 }
 
 pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
-    check_folders(&args.scenes)?;
+    check_folders(&args.sweeps.scenes)?;
     let config = SgLocTrainConfig {
-        scenes: args.scenes.clone(),
-        scene_name: args.scene_name.clone(),
+        scenes: args.sweeps.scenes.clone(),
+        scene_name: args.sweeps.scene_name.clone(),
         encoder: args.encoder.clone(),
         run: run_config(&args.options, args.batch, args.lr)?,
     };

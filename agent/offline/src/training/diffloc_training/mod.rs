@@ -146,6 +146,7 @@ impl Training<'_> {
         let mut noise = Vec::new();
         while self.share_done() < 1.0 {
             let losses = self.step()?;
+            self.trainer.check_interruption(&self.variables)?;
             noise.push(losses.noise);
             let step = self.trainer.steps();
             if step.is_multiple_of(REPORT_EVERY) || self.share_done() >= 1.0 {

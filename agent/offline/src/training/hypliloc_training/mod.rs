@@ -83,6 +83,7 @@ pub fn train_hypliloc(
         let poses = network.forward(&batch, run.precision.kind(), true)?;
         let loss = criteria.loss(&poses, &truth)?;
         trainer.step(&loss, share_done(&trainer))?;
+        trainer.check_interruption(&variables)?;
         errors += mean_errors(&poses.fusion, &truth, &examples.scale_m)?;
         let step = trainer.steps();
         if step.is_multiple_of(REPORT_EVERY) {

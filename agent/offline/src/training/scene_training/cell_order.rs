@@ -128,6 +128,7 @@ mod tests {
             targets_m: cells(3),
             sensor_m: cells(3),
             sweeps: Tensor::zeros([10, 1], (Kind::Float, Device::Cpu)),
+            points: vec![1; 10],
             world_from_sensor: vec![nalgebra::Isometry3::identity(); 10],
             origin_m: [0.0; 3],
         }

@@ -80,6 +80,7 @@ pub(crate) fn train_scene_on(
     let mut last_validation = Instant::now();
     while training.share_done() < 1.0 {
         training.step()?;
+        training.trainer.check_interruption(&training.variables)?;
         if training.trainer.steps().is_multiple_of(REPORT_EVERY) {
             observe(&training.report());
         }
@@ -186,7 +187,7 @@ impl<'a> Training<'a> {
             Length::Time(limit) => {
                 // The schedule of the head begins when the features are computed.
                 let limit = (limit.as_secs_f64() - self.preparing_seconds).max(1.0);
-                (self.trainer.seconds() - self.preparing_seconds) / limit
+                self.trainer.seconds_of_steps() / limit
             }
             _ => self.trainer.share_done(self.order.passes()),
         }
@@ -312,6 +313,7 @@ fn head_config(config: &SceneTrainConfig, features: &Features) -> Result<SceneHe
         origin_m: training.origin_m,
         max_cells: MAX_CELLS,
         refiner: config.refiner.then(refiner).transpose()?,
+        sweep_points: median_points(&training.points),
     })
 }
 
@@ -322,6 +324,13 @@ struct Window {
     error_m: f64,
     epsilon_m: f64,
     refined_m: f64,
+}
+
+/// Median of the sweeps' numbers of points.
+fn median_points(points: &[usize]) -> Option<usize> {
+    let mut sorted = points.to_vec();
+    sorted.sort_unstable();
+    sorted.get(sorted.len() / 2).copied()
 }
 
 fn mean(values: &Tensor) -> Result<f64, tch::TchError> {

@@ -1,0 +1,129 @@
+//! Odometry and gyroscopes of a ROS 2 network as the motion of the run's agents: one message for each sweep of a LiDAR.
+
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use bus::{Bus, BusError, Publisher, PublisherOptions};
+use protocol::{CavId, EgoMotion, Stream, Topic};
+use ros2::{MotionType, Qos, RosName, TimedMotion};
+use serde::Serialize;
+
+use super::agent_topic::AgentTopic;
+use super::motion_series::MotionSeries;
+use super::refusal_log::RefusalLog;
+use super::session::{RosSession, RosSubscription};
+
+/// A topic with the motion of a vehicle.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct MotionSource {
+    /// Type of its messages.
+    pub motion_type: MotionType,
+    /// Topic and vehicle.
+    pub source: AgentTopic,
+}
+
+/// Messages of a topic of motion, counted.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
+pub struct MotionReport {
+    /// Messages that were read.
+    pub read: u64,
+    /// Messages that could not be read, or in which nothing is measured.
+    pub unreadable: u64,
+}
+
+/// Measurements of one vehicle.
+#[derive(Debug, Default)]
+struct Measurements {
+    speed_mps: MotionSeries,
+    yaw_rate_rad_s: MotionSeries,
+    reports: BTreeMap<RosName, MotionReport>,
+}
+
+/// Motion of one vehicle.
+pub(super) struct MotionInput {
+    measurements: Arc<Mutex<Measurements>>,
+    publisher: Publisher,
+    _subscriptions: Vec<RosSubscription>,
+}
+
+impl MotionInput {
+    /// Subscribes to those of `sources` that are of `cav`; `None` if there are none.
+    pub(super) fn open(
+        bus: &Bus,
+        session: &RosSession,
+        cav: &CavId,
+        sources: &[MotionSource],
+    ) -> Result<Option<Self>, BusError> {
+        let own: Vec<&MotionSource> = sources.iter().filter(|source| source.source.cav == *cav).collect();
+        if own.is_empty() {
+            return Ok(None);
+        }
+        // A gyroscope measures turns better than wheels.
+        let has_imu = own.iter().any(|source| source.motion_type == MotionType::Imu);
+        let measurements = Arc::<Mutex<Measurements>>::default();
+        let subscribe = |source: &&MotionSource| {
+            let MotionSource { motion_type, source: AgentTopic { topic, .. } } = (*source).clone();
+            let (measurements, ros_type) = (Arc::clone(&measurements), motion_type.ros_type());
+            lock(&measurements).reports.insert(topic.clone(), MotionReport::default());
+            let takes_yaw_rate = motion_type == MotionType::Imu || !has_imu;
+            let log = Mutex::new(RefusalLog::of(topic.clone(), ros_type));
+            session.subscribe(&topic.clone(), ros_type, Qos::SENSOR_DATA, move |sample| {
+                let read = motion_type.read(&sample.payload().to_bytes());
+                if let Err(error) = &read {
+                    log.lock().unwrap_or_else(PoisonError::into_inner).warn(error);
+                }
+                lock(&measurements).add(&topic, read.ok(), takes_yaw_rate);
+            })
+        };
+        let subscriptions = own.iter().map(subscribe).collect::<Result<_, _>>()?;
+        let imu = Topic::Stream { cav: cav.clone(), stream: Stream::Imu };
+        let publisher = bus.publisher(imu, PublisherOptions::POSE)?;
+        Ok(Some(Self { measurements, publisher, _subscriptions: subscriptions }))
+    }
+
+    /// Publishes the motion at the capture time of a sweep: speed then, mean yaw rate since the sweep before. True if
+    /// either is known.
+    pub(super) fn publish(&mut self, previous_nanos: Option<u64>, capture_nanos: u64) -> bool {
+        let motion = lock(&self.measurements).motion(previous_nanos, capture_nanos);
+        let is_known = motion != EgoMotion::default();
+        if is_known {
+            self.publisher.submit(capture_nanos, motion);
+        }
+        is_known
+    }
+
+    /// Ends the stream; messages by topic.
+    pub(super) fn finish(self) -> BTreeMap<String, MotionReport> {
+        let reports = std::mem::take(&mut lock(&self.measurements).reports);
+        self.publisher.finish();
+        reports.into_iter().map(|(topic, report)| (topic.to_string(), report)).collect()
+    }
+}
+
+impl Measurements {
+    fn add(&mut self, topic: &RosName, read: Option<TimedMotion>, takes_yaw_rate: bool) {
+        let report = self.reports.entry(topic.clone()).or_default();
+        let Some(TimedMotion { capture_nanos, motion }) = read else {
+            report.unreadable += 1;
+            return;
+        };
+        report.read += 1;
+        if let Some(speed_mps) = motion.speed_mps {
+            self.speed_mps.add(capture_nanos, speed_mps);
+        }
+        if let Some(yaw_rate_rad_s) = motion.yaw_rate_rad_s.filter(|_| takes_yaw_rate) {
+            self.yaw_rate_rad_s.add(capture_nanos, yaw_rate_rad_s);
+        }
+    }
+
+    fn motion(&self, previous_nanos: Option<u64>, capture_nanos: u64) -> EgoMotion {
+        EgoMotion {
+            speed_mps: self.speed_mps.at(capture_nanos),
+            yaw_rate_rad_s: self.yaw_rate_rad_s.mean(previous_nanos.unwrap_or(capture_nanos), capture_nanos),
+        }
+    }
+}
+
+fn lock(measurements: &Mutex<Measurements>) -> MutexGuard<'_, Measurements> {
+    measurements.lock().unwrap_or_else(PoisonError::into_inner)
+}

@@ -1,0 +1,111 @@
+//! A measured quantity over time: its value at the capture time of a sweep, and its mean between two of them.
+//!
+//! Odometry and gyroscopes have rates and stamps of their own, a sweep's motion has that of the sweep.
+
+use std::collections::VecDeque;
+
+/// Longest time from a measurement to the next, and to a time that has none after it, nanoseconds: 0.2 s.
+const MAX_GAP_NANOS: u64 = 200_000_000;
+/// Time for which measurements are kept, nanoseconds: some sweeps.
+const KEPT_NANOS: u64 = 2_000_000_000;
+/// Most measurements that are kept.
+const MOST: usize = 4096;
+
+/// Measurements in the order of time.
+#[derive(Debug, Default)]
+pub(super) struct MotionSeries(VecDeque<(u64, f64)>);
+
+impl MotionSeries {
+    /// Adds a measurement. Those of later times are dropped: a bag has begun again.
+    pub(super) fn add(&mut self, nanos: u64, value: f64) {
+        while self.0.back().is_some_and(|(last, _)| *last >= nanos) {
+            self.0.pop_back();
+        }
+        self.0.push_back((nanos, value));
+        let is_old = |first: &(u64, f64)| nanos - first.0 > KEPT_NANOS;
+        while self.0.len() > MOST || self.0.front().is_some_and(is_old) {
+            self.0.pop_front();
+        }
+    }
+
+    /// The value at a time: between two measurements the straight line, else the nearest one that is near enough.
+    pub(super) fn at(&self, nanos: u64) -> Option<f64> {
+        let next = self.0.partition_point(|(time, _)| *time < nanos);
+        let before = next.checked_sub(1).and_then(|index| self.0.get(index)).copied();
+        let after = self.0.get(next).copied();
+        match (before, after) {
+            (Some((from, first)), Some((to, last))) if to - from <= MAX_GAP_NANOS => {
+                Some(first + (last - first) * seconds(nanos - from) / seconds(to - from))
+            }
+            _ => {
+                let near =
+                    [before, after].into_iter().flatten().filter(|(time, _)| time.abs_diff(nanos) <= MAX_GAP_NANOS);
+                near.min_by_key(|(time, _)| time.abs_diff(nanos)).map(|(_, value)| value)
+            }
+        }
+    }
+
+    /// The mean from one time to a later one, by the trapezoidal rule; the value at `to` where that at `from` is unknown
+    /// or none after it.
+    pub(super) fn mean(&self, from: u64, to: u64) -> Option<f64> {
+        let last = self.at(to)?;
+        let Some(first) = self.at(from).filter(|_| from < to) else { return Some(last) };
+        let between = self.0.iter().copied().filter(|(time, _)| (from + 1..to).contains(time));
+        let (mut sum, mut previous) = (0.0, (from, first));
+        for next in between.chain([(to, last)]) {
+            sum += 0.5 * (previous.1 + next.1) * seconds(next.0 - previous.0);
+            previous = next;
+        }
+        Some(sum / seconds(to - from))
+    }
+}
+
+fn seconds(nanos: u64) -> f64 {
+    nanos as f64 * 1e-9
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const MS: u64 = 1_000_000;
+
+    fn series(values: &[(u64, f64)]) -> MotionSeries {
+        let mut series = MotionSeries::default();
+        values.iter().for_each(|(ms, value)| series.add(ms * MS, *value));
+        series
+    }
+
+    #[test]
+    fn a_value_is_interpolated_and_held_for_a_short_time() {
+        let series = series(&[(1000, 2.0), (1020, 4.0), (1500, 9.0)]);
+        let at = |ms: u64| series.at(ms * MS);
+        assert_eq!([at(1000), at(1010), at(1020)], [Some(2.0), Some(3.0), Some(4.0)]);
+        assert_eq!([at(900), at(1100), at(1600)], [Some(2.0), Some(4.0), Some(9.0)]);
+        assert_eq!([at(700), at(1250), at(1701)], [None; 3]);
+        assert_eq!(MotionSeries::default().at(5), None);
+    }
+
+    #[test]
+    fn the_mean_of_a_line_is_its_middle_and_that_of_a_constant_the_constant() {
+        let line = series(&(0..=10).map(|k| (1000 + 20 * k, k as f64)).collect::<Vec<_>>());
+        assert!((line.mean(1000 * MS, 1200 * MS).unwrap() - 5.0).abs() < 1e-9);
+        assert!((line.mean(1050 * MS, 1150 * MS).unwrap() - 5.0).abs() < 1e-9);
+        let constant = series(&[(1000, 0.5), (1030, 0.5), (1110, 0.5)]);
+        assert!((constant.mean(1010 * MS, 1200 * MS).unwrap() - 0.5).abs() < 1e-12);
+        assert_eq!(constant.mean(100 * MS, 1100 * MS), Some(0.5), "nothing is known of the beginning");
+        assert_eq!(constant.mean(1100 * MS, 1100 * MS), Some(0.5));
+        assert_eq!(constant.mean(1000 * MS, 2000 * MS), None);
+    }
+
+    #[test]
+    fn a_bag_that_begins_again_leaves_nothing_of_before() {
+        let mut series = series(&[(1000, 1.0), (1020, 2.0)]);
+        series.add(500 * MS, 7.0);
+        assert_eq!((series.at(1010 * MS), series.at(500 * MS)), (None, Some(7.0)));
+        (0..10_000).for_each(|k| series.add(3_000 * MS + k, 0.0));
+        assert_eq!(series.0.len(), MOST);
+        series.add(9_000 * MS, 0.0);
+        assert_eq!(series.0.len(), 1);
+    }
+}

@@ -1,0 +1,289 @@
+//! Reader of a vehicle's motion: speed and yaw rate from the messages of wheel odometry and gyroscopes.
+//!
+//! Axes are those of REP-103, which are ours: x forward, y left, z up; a turn to the left is positive. The speed is that
+//! along x, the yaw rate that about z of the frame that the message names (of `nav_msgs/Odometry` the child frame, which
+//! is the body).
+
+use protocol::EgoMotion;
+use re_cdr::{ByteOrder, CdrReader};
+
+use crate::RosType;
+use crate::read::{Body, Header, ReadError, Reader};
+
+/// Variance from which a value counts as not measured: drivers write it, as we do, where they measure nothing.
+const UNMEASURED: f64 = 1e6;
+
+/// A message that a motion can be read from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum MotionType {
+    /// `nav_msgs/Odometry`: speed and yaw rate.
+    Odometry,
+    /// `geometry_msgs/TwistStamped`: speed and yaw rate.
+    TwistStamped,
+    /// `sensor_msgs/Imu`: yaw rate.
+    Imu,
+}
+
+/// A motion at one time.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TimedMotion {
+    /// Capture time: stamp of the header, nanoseconds.
+    pub capture_nanos: u64,
+    /// Speed and yaw rate; absent ones are not measured.
+    pub motion: EgoMotion,
+}
+
+/// Error of a message that no motion can be read from.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum MotionError {
+    /// The message is no CDR, ends early or has no time.
+    #[error(transparent)]
+    Message(#[from] ReadError),
+    /// A value is no number, or one that no vehicle reaches.
+    #[error("{field} is {found}, not from -{limit} to {limit}")]
+    Value {
+        /// Name of the field.
+        field: &'static str,
+        /// Its value.
+        found: f64,
+        /// Largest absolute value.
+        limit: f64,
+    },
+    /// The sensor states that it does not measure this.
+    #[error("{field} is {found}: nothing is measured")]
+    Unmeasured {
+        /// Name of the field.
+        field: &'static str,
+        /// Its value.
+        found: f64,
+    },
+}
+
+impl MotionType {
+    /// The type of the message.
+    #[must_use]
+    pub fn ros_type(self) -> RosType {
+        match self {
+            Self::Odometry => RosType::Odometry,
+            Self::TwistStamped => RosType::TwistStamped,
+            Self::Imu => RosType::Imu,
+        }
+    }
+
+    /// True if the message has a speed.
+    #[must_use]
+    pub fn has_speed(self) -> bool {
+        self != Self::Imu
+    }
+
+    /// Reads a message in CDR, with its encapsulation header.
+    ///
+    /// # Errors
+    /// [`MotionError`] names the field and its value.
+    pub fn read(self, bytes: &[u8]) -> Result<TimedMotion, MotionError> {
+        match Body::of(bytes)? {
+            Body::BigEndian(message) => self.read_body(message),
+            Body::LittleEndian(message) => self.read_body(message),
+        }
+    }
+
+    fn read_body<BO: ByteOrder>(self, mut message: Reader<'_, BO>) -> Result<TimedMotion, MotionError> {
+        let Header { nanos, .. } = message.header()?;
+        let motion = match self {
+            Self::Odometry => {
+                message.read("child_frame_id", CdrReader::read_str)?;
+                message.f64s::<7>("pose.pose")?;
+                message.f64s::<36>("pose.covariance")?;
+                let motion = read_twist(&mut message, ["twist.twist.linear.x", "twist.twist.angular.z"])?;
+                let covariance: [f64; 36] = message.f64s("twist.covariance")?;
+                measured(motion, &covariance)?
+            }
+            Self::TwistStamped => read_twist(&mut message, ["twist.linear.x", "twist.angular.z"])?,
+            Self::Imu => {
+                message.f64s::<4>("orientation")?;
+                message.f64s::<9>("orientation_covariance")?;
+                let [_, _, z] = message.f64s("angular_velocity")?;
+                let [first, ..] = message.f64s::<9>("angular_velocity_covariance")?;
+                // REP-145: the first element is -1 where a sensor has no such measurement.
+                if first.to_bits() == (-1.0_f64).to_bits() {
+                    return Err(MotionError::Unmeasured { field: "angular_velocity_covariance[0]", found: first });
+                }
+                EgoMotion { speed_mps: None, yaw_rate_rad_s: Some(yaw_rate("angular_velocity.z", z)?) }
+            }
+        };
+        Ok(TimedMotion { capture_nanos: nanos, motion })
+    }
+}
+
+/// `geometry_msgs/Twist`; errors name the fields of speed and yaw rate.
+fn read_twist<BO: ByteOrder>(
+    message: &mut Reader<'_, BO>,
+    [speed_field, yaw_rate_field]: [&'static str; 2],
+) -> Result<EgoMotion, MotionError> {
+    let [speed_mps, _, _] = message.f64s(speed_field)?;
+    let [_, _, z] = message.f64s(yaw_rate_field)?;
+    let speed_mps = within(speed_field, speed_mps, EgoMotion::MAX_SPEED_MPS)?;
+    Ok(EgoMotion { speed_mps: Some(speed_mps), yaw_rate_rad_s: Some(yaw_rate(yaw_rate_field, z)?) })
+}
+
+/// The values of `motion` that are measured by their variances.
+fn measured(motion: EgoMotion, covariance: &[f64; 36]) -> Result<EgoMotion, MotionError> {
+    let [speed_variance, .., yaw_rate_variance] = covariance;
+    let EgoMotion { speed_mps, yaw_rate_rad_s } = motion;
+    let speed_mps = speed_mps.filter(|_| *speed_variance < UNMEASURED);
+    let yaw_rate_rad_s = yaw_rate_rad_s.filter(|_| *yaw_rate_variance < UNMEASURED);
+    if speed_mps.is_none() && yaw_rate_rad_s.is_none() {
+        return Err(MotionError::Unmeasured { field: "twist.covariance[0]", found: *speed_variance });
+    }
+    Ok(EgoMotion { speed_mps, yaw_rate_rad_s })
+}
+
+fn yaw_rate(field: &'static str, found: f64) -> Result<f64, MotionError> {
+    within(field, found, EgoMotion::MAX_YAW_RATE_RAD_S)
+}
+
+fn within(field: &'static str, found: f64, limit: f64) -> Result<f64, MotionError> {
+    // A value that is no number is within nothing.
+    if found.abs() <= limit { Ok(found) } else { Err(MotionError::Value { field, found, limit }) }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+    use re_cdr::{BigEndian, CdrWriter, LittleEndian};
+
+    use super::*;
+
+    const TYPES: [MotionType; 3] = [MotionType::Odometry, MotionType::TwistStamped, MotionType::Imu];
+
+    /// The numbers of a message, in the order of ROS.
+    #[derive(Debug, Clone, Copy)]
+    struct Numbers {
+        linear: [f64; 3],
+        angular: [f64; 3],
+        /// Of x, and of the rotation about z; of an IMU the first is that of its first axis.
+        variances: [f64; 2],
+    }
+
+    impl Numbers {
+        fn of(speed: f64, yaw_rate: f64) -> Self {
+            Self { linear: [speed, 3.0, 4.0], angular: [5.0, 6.0, yaw_rate], variances: [0.01, 0.02] }
+        }
+    }
+
+    fn f64s<BO: ByteOrder>(cdr: &mut CdrWriter<'_, BO>, values: &[f64]) {
+        values.iter().for_each(|value| cdr.write_f64(*value));
+    }
+
+    fn written<BO: ByteOrder>(ty: MotionType, encoding: [u8; 4], numbers: Numbers) -> Vec<u8> {
+        let mut bytes = encoding.to_vec();
+        let mut cdr = CdrWriter::<BO>::new(&mut bytes);
+        cdr.write_i32(7);
+        cdr.write_u32(8);
+        cdr.write_string("odom");
+        match ty {
+            MotionType::Odometry => {
+                cdr.write_string("base_link");
+                f64s(&mut cdr, &[9.0; 7 + 36]);
+                f64s(&mut cdr, &numbers.linear);
+                f64s(&mut cdr, &numbers.angular);
+                let mut covariance = [0.0; 36];
+                [covariance[0], covariance[35]] = numbers.variances;
+                f64s(&mut cdr, &covariance);
+            }
+            MotionType::TwistStamped => {
+                f64s(&mut cdr, &numbers.linear);
+                f64s(&mut cdr, &numbers.angular);
+            }
+            MotionType::Imu => {
+                f64s(&mut cdr, &[9.0; 4 + 9]);
+                f64s(&mut cdr, &numbers.angular);
+                let mut covariance = [0.0; 9];
+                covariance[0] = numbers.variances[0];
+                f64s(&mut cdr, &covariance);
+                f64s(&mut cdr, &[9.0; 3 + 9]);
+            }
+        }
+        bytes
+    }
+
+    fn little(ty: MotionType, numbers: Numbers) -> Vec<u8> {
+        written::<LittleEndian>(ty, [0, 1, 0, 0], numbers)
+    }
+
+    #[test]
+    fn our_own_odometry_is_read_back_with_what_it_measures() {
+        let cav = protocol::CavId::new("1").unwrap();
+        let pose = protocol::Pose::from_xyz_yaw([1.0, 2.0, 3.0], 0.5);
+        for motion in [
+            EgoMotion { speed_mps: Some(8.0), yaw_rate_rad_s: Some(-0.25) },
+            EgoMotion { speed_mps: None, yaw_rate_rad_s: Some(0.5) },
+            EgoMotion { speed_mps: Some(-1.0), yaw_rate_rad_s: None },
+        ] {
+            let bytes = crate::encode::odometry(1_700_000_000_000_000_001, &cav, &pose, None, motion);
+            let expected = TimedMotion { capture_nanos: 1_700_000_000_000_000_001, motion };
+            assert_eq!(MotionType::Odometry.read(&bytes), Ok(expected));
+        }
+        let bytes = crate::encode::odometry(5, &cav, &pose, None, EgoMotion::default());
+        let error = MotionType::Odometry.read(&bytes).unwrap_err().to_string();
+        assert_eq!(error, "twist.covariance[0] is 1000000: nothing is measured");
+    }
+
+    #[test]
+    fn a_wrong_message_is_named_with_field_and_value() {
+        let error = |ty: MotionType, numbers| ty.read(&little(ty, numbers)).unwrap_err().to_string();
+        assert_eq!(
+            error(MotionType::Odometry, Numbers::of(f64::NAN, 0.0)),
+            "twist.twist.linear.x is NaN, not from -200 to 200"
+        );
+        assert_eq!(
+            error(MotionType::TwistStamped, Numbers::of(1.0, -30.0)),
+            "twist.angular.z is -30, not from -20 to 20"
+        );
+        let unmeasured = Numbers { variances: [-1.0, 0.0], ..Numbers::of(1.0, 0.5) };
+        assert!(error(MotionType::Imu, unmeasured).contains("angular_velocity_covariance[0] is -1"));
+        for ty in TYPES {
+            let bytes = little(ty, Numbers::of(1.0, 0.5));
+            let cut = ty.read(&bytes[..bytes.len() / 2]).unwrap_err().to_string();
+            assert!(cut.contains(" at byte "), "{cut}");
+            assert!(matches!(ty.read(&[9; 40]), Err(MotionError::Message(ReadError::Encoding { .. }))));
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn either_byte_order_gives_the_same_motion(speed in -200.0..200.0, yaw_rate in -20.0..20.0) {
+            let numbers = Numbers::of(speed, yaw_rate);
+            for ty in TYPES {
+                let expected = TimedMotion {
+                    capture_nanos: 7_000_000_008,
+                    motion: EgoMotion { speed_mps: ty.has_speed().then_some(speed), yaw_rate_rad_s: Some(yaw_rate) },
+                };
+                prop_assert_eq!(ty.read(&little(ty, numbers)).unwrap(), expected.clone());
+                let big = written::<BigEndian>(ty, [0, 0, 0, 0], numbers);
+                prop_assert_eq!(ty.read(&big).unwrap(), expected);
+            }
+        }
+
+        #[test]
+        fn changed_bytes_are_refused_or_read_within_the_limits(
+            changes in prop::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 1..8),
+            cut in any::<prop::sample::Index>(),
+        ) {
+            for ty in TYPES {
+                let mut bytes = little(ty, Numbers::of(1.0, 0.5));
+                for (place, byte) in &changes {
+                    let place = place.index(bytes.len());
+                    bytes[place] = *byte;
+                }
+                for bytes in [&bytes[..], &bytes[..cut.index(bytes.len())]] {
+                    if let Ok(TimedMotion { motion, .. }) = ty.read(bytes) {
+                        prop_assert!(motion.speed_mps.is_none_or(|speed| speed.abs() <= EgoMotion::MAX_SPEED_MPS));
+                        let rate = motion.yaw_rate_rad_s;
+                        prop_assert!(rate.is_none_or(|rate| rate.abs() <= EgoMotion::MAX_YAW_RATE_RAD_S));
+                    }
+                }
+            }
+        }
+    }
+}
