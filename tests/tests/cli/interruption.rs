@@ -71,7 +71,7 @@ fn every_training_stops_with_a_checkpoint_and_is_resumed() {
     let trainings: [&[&str]; 6] = [
         &["agent", "train", "scene", "--scenes", &drives, "--encoder", &encoder, "--batch", "64"],
         &["agent", "train", "encoder", "--scenes", &drives, "--batch", "1"],
-        &["agent", "train", "end-to-end", "--scenes", &drives, "--regresses", "pose", "--encoder", &encoder],
+        &["agent", "train", "sgloc", "--scenes", &drives, "--encoder", &encoder],
         &["agent", "train", "diffloc", "--scenes", &drives, "--batch", "3"],
         &["agent", "train", "hypliloc", "--scenes", &drives, "--batch", "2"],
         &["ego-fuser", "train", "--dataset", &drives, "--batch", "1"],

@@ -26,7 +26,7 @@ enum Kind {
     /// Estimated by PGC and followed from sweep to sweep.
     Tracked,
     /// Estimated from the LiDAR sweep alone, by a baseline of the paper: SGLoc, DiffLoc or HypLiLoc.
-    SgLoc,
+    Baseline,
     /// Read from a table that `agent localize` wrote.
     Cached,
 }
