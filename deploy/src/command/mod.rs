@@ -31,22 +31,28 @@ pub(crate) const RUNNER: Sibling = Sibling {
     ],
 };
 
-/// Subcommands of `v2vloc` that compute no network.
+/// Subcommands of `v2vloc` that compute no network, listed behind those that do.
 #[derive(Debug, clap::Subcommand)]
 pub(crate) enum Command {
     /// Print stages, pace, latency, CPU, memory and bytes of a run that has ended.
+    #[command(display_order = 20)]
     Report(report::Arguments),
     /// Show a run in a browser: the scene from above, the links, the latency of each stage.
+    #[command(display_order = 21)]
     View(view::Arguments),
     /// Report the state of a run: every process present, ready and answering? Exit code 1 if not.
+    #[command(display_order = 22)]
     Status(status::Arguments),
     /// Run the router of a fleet whose processes are on several hosts, or write the configuration of a zenohd in its
     /// place.
+    #[command(display_order = 23)]
     Router(router::Arguments),
     /// Make a test authority and certificates for the processes of a fleet.
+    #[command(display_order = 24)]
     Keys(keys::Arguments),
     /// Connect a run with a ROS 2 network through rmw_zenoh: poses, odometry, detections, clouds, transforms and
     /// diagnoses; and LiDARs of the network with the agents of the run.
+    #[command(display_order = 25)]
     Ros2(Box<ros2::Arguments>),
 }
 

@@ -18,6 +18,9 @@ pub(crate) const GENERATE: &str = "V2VLOC_GENERATE";
 /// Value of the variable that asks for the subcommands and their options as JSON: what a program asks its sibling for.
 pub(crate) const DESCRIPTION: &str = "description";
 
+/// Place of the last option in the help, before `--help`.
+const LAST: usize = 998;
+
 /// Parses the command line of this process; sets the verbosity of its messages. Ends the process on wrong usage, as
 /// [`Parser::parse`].
 #[must_use]
@@ -57,8 +60,13 @@ fn with_verbosity(command: Command) -> Command {
     let verbose = Arg::new("verbose").short('v').long("verbose").action(ArgAction::Count).global(true);
     let quiet = Arg::new("quiet").short('q').long("quiet").action(ArgAction::SetTrue).global(true);
     command
-        .arg(verbose.help("Log more, -vv even more; RUST_LOG sets single parts").conflicts_with("quiet"))
-        .arg(quiet.help("Errors only on standard error: no progress, notes and warnings"))
+        .arg(
+            verbose
+                .help("Log more, -vv even more; RUST_LOG sets single parts")
+                .conflicts_with("quiet")
+                .display_order(LAST - 1),
+        )
+        .arg(quiet.help("Errors only on standard error: no progress, notes and warnings").display_order(LAST))
 }
 
 fn verbosity(verbose: u8, quiet: bool) -> Verbosity {

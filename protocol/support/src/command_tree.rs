@@ -42,6 +42,7 @@ struct ArgumentTree {
     values: Vec<ValueTree>,
     hides_values: bool,
     conflicts: Vec<String>,
+    requires_equals: bool,
     is_required: bool,
     is_hidden: bool,
     is_global: bool,
@@ -135,6 +136,7 @@ impl ArgumentTree {
                 .iter()
                 .map(|other| other.get_id().to_string())
                 .collect(),
+            requires_equals: argument.is_require_equals_set(),
             is_required: argument.is_required_set(),
             is_hidden: argument.is_hide_set(),
             is_global: argument.is_global_set(),
@@ -166,6 +168,7 @@ impl ArgumentTree {
             .value_parser((!self.values.is_empty()).then(|| ValueParser::from(values())))
             .hide_possible_values(self.hides_values)
             .conflicts_with_all(self.conflicts.iter().map(|id| kept(id)))
+            .require_equals(self.requires_equals)
             .required(self.is_required)
             .hide(self.is_hidden)
             .global(self.is_global)
@@ -273,6 +276,8 @@ mod tests {
         count: u8,
         #[arg(long, hide = true)]
         worker: bool,
+        #[arg(long, num_args = 0..=1, require_equals = true, default_missing_value = "true")]
+        clock: Option<bool>,
         rest: Option<String>,
     }
 
