@@ -407,7 +407,7 @@ fn the_odometry_of_a_robot_is_the_motion_of_its_agent_at_every_sweep() {
             }
         };
         let capture = arrival.header.stamp.capture_nanos;
-        assert!(capture > AT && (capture - AT) % 1_000_000_000 == 0, "the time of a sweep, {capture}");
+        assert!(capture > AT && (capture - AT).is_multiple_of(1_000_000_000), "the time of a sweep, {capture}");
         let motion: EgoMotion = inbox.decode(&arrival, &Limits::DEFAULT).unwrap();
         let (speed_mps, yaw_rate_rad_s) = (motion.speed_mps.unwrap(), motion.yaw_rate_rad_s.unwrap());
         assert!((speed_mps - 5.0).abs() < 1e-9 && (yaw_rate_rad_s + 0.5).abs() < 1e-9, "{motion:?}");
