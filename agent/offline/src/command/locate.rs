@@ -132,7 +132,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     if found == 0 && !lost.is_empty() {
         let (head, map) = (head.display(), &localizer.head_config().scene_name);
         output::note(format_args!(
-            "no cloud found itself: is {head} the head of this place and this LiDAR? Its map is {map}"
+            "no cloud found itself: is {head} the head of this place and this LiDAR, and were these roads driven for \
+             it? Its map is {map}"
         ));
     }
     if let Some(hint) = other_lidar_hint(localizer.head_config().sweep_points, &lost) {

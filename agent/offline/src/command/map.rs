@@ -139,8 +139,9 @@ fn text(report: &MapReport) -> String {
         format!("rejects {} of {} wrong poses, {} of {good} right ones", fit.bad_rejected, fit.bad, fit.good_rejected)
     });
     format!(
-        "place      {}\naccuracy   {accuracy}\nconfidence {confidence}\ndriven     {}\n{}{}\n",
+        "place      {}\ntraining   {}\naccuracy   {accuracy}\nconfidence {confidence}\ndriven     {}\n{}{}\n",
         report.place,
+        report.training_text(),
         report.coverage_text(),
         indented(&report.coverage.picture()),
         report.limits_text()

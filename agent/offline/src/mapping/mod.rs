@@ -6,7 +6,7 @@ mod held_out;
 mod plan;
 mod report;
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -36,8 +36,6 @@ const PROBES: usize = 8;
 const BATCHES: usize = 40;
 const LEAST_BATCH: usize = 512;
 const MOST_BATCH: usize = 1024;
-/// Sweeps of the search for scales.
-const SCALE_SWEEPS: usize = 30;
 /// Largest share of good poses that the confidence may reject.
 const GOOD_LOSS: f64 = 0.01;
 /// Time between two checkpoints.
@@ -145,7 +143,7 @@ pub fn make_map(config: &MapConfig, observe: &mut dyn FnMut(MapProgress)) -> Res
     let (summary, run) = map.train(&training, &plan)?;
     map.copy_encoder()?;
     let weights = summary.trained.weights.clone();
-    let activation_scales = map.quantise(&weights, &training)?;
+    let activation_scales = map.quantise(&weights, &training, plan.scale_sweeps)?;
     let mut checked = map.check(&weights, &held_out)?;
     let (confidence, sha256) = map.fit(&weights, &mut checked)?;
     let mut data = training.data();
@@ -157,6 +155,7 @@ pub fn make_map(config: &MapConfig, observe: &mut dyn FnMut(MapProgress)) -> Res
         sha256: sha256.unwrap_or_else(|| summary.trained.sha256.clone()),
         training_sweeps: summary.sweeps / plan.copies.max(1),
         copies: plan.copies,
+        cell_error_m: summary.error_m,
         held_out: accuracy,
         confidence,
         activation_scales,
@@ -298,7 +297,7 @@ impl Map<'_> {
     }
 
     fn announce(&mut self, sweeps: &Sweeps, plan: &Plan, wanted: usize) {
-        let Plan { training, copies, checked, encoding_s, check_s } = *plan;
+        let Plan { training, copies, checked, encoding_s, scales_s, check_s, .. } = *plan;
         let total_s = self.config.time.as_secs_f64();
         if training < wanted {
             let minutes = (total_s * wanted as f64 / training as f64 / 60.0).ceil();
@@ -307,18 +306,18 @@ impl Map<'_> {
                  {minutes:.0} would use all"
             ));
         }
-        let training_s = (total_s - self.seconds() - encoding_s - check_s).max(0.0);
+        let training_s = (total_s - self.seconds() - encoding_s - plan.after_training_s()).max(0.0);
         let copies = if copies > 1 { format!(" in {copies} copies, rotated and thinned") } else { String::new() };
         self.note(format!(
             "{training} training sweeps{copies}, {checked} of {} held-out sweeps; encoding {encoding_s:.0} s, training \
-             {training_s:.0} s, check {check_s:.0} s: {:.1} min in all",
+             {training_s:.0} s, scales for 8-bit inference {scales_s:.0} s, check {check_s:.0} s: {:.1} min in all",
             sweeps.held_out.len(),
             total_s / 60.0
         ));
     }
 
     fn train(&mut self, training: &Arc<SweepList>, plan: &Plan) -> Result<(SceneSummary, RunConfig), MapError> {
-        let left_s = (self.config.time.as_secs_f64() - self.seconds() - plan.check_s).max(1.0);
+        let left_s = (self.config.time.as_secs_f64() - self.seconds() - plan.after_training_s()).max(1.0);
         let run = RunConfig {
             length: Length::Time(Duration::from_secs_f64(left_s)),
             batch: (plan.training * plan.copies * CELLS / BATCHES).clamp(LEAST_BATCH, MOST_BATCH),
@@ -345,7 +344,7 @@ impl Map<'_> {
         let sweeps = SceneSweeps { training: Arc::clone(training), validation: None };
         let started = self.started;
         let observe = &mut *self.observe;
-        let training_end_s = self.config.time.as_secs_f64() - plan.check_s;
+        let training_end_s = self.config.time.as_secs_f64() - plan.after_training_s();
         let mut steps_began_s = None;
         let mut tell = |report: &SceneReport| {
             let mut seconds = started.elapsed().as_secs_f64();
@@ -376,12 +375,12 @@ impl Map<'_> {
     }
 
     /// Searches the scales of activations; their number.
-    fn quantise(&mut self, weights: &std::path::Path, training: &SweepList) -> Result<usize, MapError> {
+    fn quantise(&mut self, weights: &Path, training: &SweepList, sweeps: usize) -> Result<usize, MapError> {
         self.at("scales for 8-bit inference".to_owned());
         let localizer = Localizer::load_without_confidence(&self.config.encoder, weights, Inference::FLOAT)?;
         let mut search = ScaleSearch::default();
         let all: Vec<usize> = (0..training.len()).collect();
-        for index in thinned(&all, SCALE_SWEEPS) {
+        for index in thinned(&all, sweeps) {
             if let Some((frame, ..)) = training.frame(index) {
                 localizer.observe(&frame.points, &mut search)?;
             }
@@ -394,12 +393,12 @@ impl Map<'_> {
         Ok(scales.len())
     }
 
-    fn check(&mut self, weights: &std::path::Path, held_out: &SweepList) -> Result<Check, MapError> {
+    fn check(&mut self, weights: &Path, held_out: &SweepList) -> Result<Check, MapError> {
         let localizer = Localizer::load_without_confidence(&self.config.encoder, weights, Inference::default())?;
         let started = self.started;
         let observe = &mut *self.observe;
         let mut progress = |done, all| {
-            let text = format!("checking, {done} of {all} sweeps");
+            let text = format!("checking, {done} of {all} sweeps and copies, each mirrored too");
             observe(MapProgress::At(started.elapsed().as_secs_f64(), text));
         };
         let deadline = started + self.config.time;
@@ -407,11 +406,7 @@ impl Map<'_> {
     }
 
     /// Fits the confidence, writes it into the head and applies it; the report and the new digest.
-    fn fit(
-        &mut self,
-        weights: &std::path::Path,
-        checked: &mut Check,
-    ) -> Result<(Option<FitReport>, Option<String>), MapError> {
+    fn fit(&mut self, weights: &Path, checked: &mut Check) -> Result<(Option<FitReport>, Option<String>), MapError> {
         match ConfidenceModel::fit(&checked.labelled, GOOD_LOSS) {
             Ok((model, report)) => {
                 let text = serde_json::to_string(&model).expect("a model is numbers");

@@ -16,6 +16,10 @@ const ENCODING_SHARE: f64 = 0.5;
 const CHECK_SHARE: f64 = 0.25;
 /// Most sweeps that the head is checked on.
 const MOST_CHECKED: usize = 200;
+/// Most sweeps of the search for scales, the fewest, and the largest share of the time that it takes.
+const MOST_SCALE_SWEEPS: usize = 30;
+const LEAST_SCALE_SWEEPS: usize = 5;
+const SCALES_SHARE: f64 = 0.05;
 /// Most passes that a small place gets, rotated and subsampled.
 const MOST_COPIES: usize = 40;
 /// Number of encoded sweeps from which no copies are needed.
@@ -33,13 +37,22 @@ pub(super) struct Plan {
     pub(super) copies: usize,
     /// Number of held-out sweeps that are used.
     pub(super) checked: usize,
+    /// Number of training sweeps of the search for scales.
+    pub(super) scale_sweeps: usize,
     /// Time of encoding, seconds.
     pub(super) encoding_s: f64,
+    /// Time of the search for scales, seconds.
+    pub(super) scales_s: f64,
     /// Time of the check, seconds.
     pub(super) check_s: f64,
 }
 
 impl Plan {
+    /// Time after the training, seconds.
+    pub(super) fn after_training_s(&self) -> f64 {
+        self.scales_s + self.check_s
+    }
+
     /// Plan for `total_s` seconds; `sweep_s`: of one sweep, to read and encode.
     pub(super) fn new(training: usize, held_out: usize, sweep_s: f64, total_s: f64) -> Self {
         let sweep_s = sweep_s.max(1e-4);
@@ -48,11 +61,16 @@ impl Plan {
         let most_checked = (0.2 * total_s / checked_s(1)) as usize;
         let checked = held_out.min(MOST_CHECKED).min(most_checked.max(10));
         let check_s = checked_s(if held_out > 0 { checked.max(LEAST_CHECKED) } else { 0 }).min(CHECK_SHARE * total_s);
-        let affordable = ((total_s - check_s).max(0.0) * ENCODING_SHARE / sweep_s) as usize;
+        // The localization costs as much as the encoding here too.
+        let affordable_scales = (SCALES_SHARE * total_s / (2.0 * sweep_s)) as usize;
+        let scale_sweeps = affordable_scales.clamp(LEAST_SCALE_SWEEPS, MOST_SCALE_SWEEPS).min(training);
+        let scales_s = 2.0 * sweep_s * scale_sweeps as f64;
+        let affordable = ((total_s - check_s - scales_s).max(0.0) * ENCODING_SHARE / sweep_s) as usize;
         let copies = (ENOUGH_SWEEPS / training.max(1)).clamp(1, MOST_COPIES);
         let copies = copies.min((affordable / training.max(1)).max(1));
         let training = training.min(affordable.max(1));
-        Self { training, copies, checked, encoding_s: (training * copies) as f64 * sweep_s, check_s }
+        let encoding_s = (training * copies) as f64 * sweep_s;
+        Self { training, copies, checked, scale_sweeps, encoding_s, scales_s, check_s }
     }
 }
 
@@ -117,6 +135,8 @@ mod tests {
         let plan = Plan::new(600, 80, 0.1, 600.0);
         assert_eq!((plan.training, plan.copies, plan.checked), (600, 1, 80));
         assert!((plan.encoding_s - 60.0).abs() < 1e-9 && (plan.check_s - 32.0).abs() < 1e-9);
+        assert_eq!(plan.scale_sweeps, 30);
+        assert!((plan.after_training_s() - 38.0).abs() < 1e-9);
         let short = Plan::new(16_000, 2_000, 0.1, 600.0);
         assert!(short.training < 3_000 && short.encoding_s <= 300.0 && short.check_s <= 120.0, "{short:?}");
     }
@@ -126,6 +146,7 @@ mod tests {
         let plan = Plan::new(3, 1, 0.1, 600.0);
         assert_eq!((plan.training, plan.copies, plan.checked), (3, 40, 1));
         assert!(Plan::new(3, 1, 10.0, 60.0).copies <= 2);
+        assert_eq!([Plan::new(3, 1, 10.0, 60.0), Plan::new(90, 1, 0.5, 60.0)].map(|plan| plan.scale_sweeps), [3, 5]);
     }
 
     #[test]

@@ -7,6 +7,12 @@ use serde::Serialize;
 use super::coverage::Coverage;
 use crate::evaluation::LocalizationSummary;
 
+/// Mean error of a training cell above which a training was too short, metres: at the end of a sufficient one it is a few
+/// metres.
+const SHORT_TRAINING_M: f64 = 10.0;
+/// Share of wrong poses that a confidence should reject.
+const ENOUGH_REJECTED: f64 = 0.9;
+
 /// A head for a place, and its measured accuracy.
 #[derive(Debug, Clone, Serialize)]
 pub struct MapReport {
@@ -18,6 +24,8 @@ pub struct MapReport {
     pub training_sweeps: usize,
     /// Encoded copies of each.
     pub copies: usize,
+    /// Mean error of a training cell in the last steps, metres; `None` where a resumed training had none left.
+    pub cell_error_m: Option<f64>,
     /// Accuracy on held-out sweeps; `None` if there were too few sweeps to hold any out.
     pub held_out: Option<HeldOutAccuracy>,
     /// Fit of the confidence; `None` if there were too few poses: then hardly any pose is rejected.
@@ -83,7 +91,7 @@ impl MapReport {
     pub fn coverage_text(&self) -> String {
         let Coverage { sweeps, length_m, low_m, high_m, cells, cell_m, .. } = &self.coverage;
         format!(
-            "{sweeps} sweeps along {length_m:.0} m, x {:.0} to {:.0} m, y {:.0} to {:.0} m, {} cells of {cell_m:.0} m",
+            "{sweeps} sweeps along {length_m:.0} m, x {:.0} to {:.0} m, y {:.0} to {:.0} m, {} cells of {cell_m:.0} m (#; x to the right, y up)",
             low_m[0],
             high_m[0],
             low_m[1],
@@ -92,16 +100,42 @@ impl MapReport {
         )
     }
 
+    /// The training, in one line.
+    #[must_use]
+    pub fn training_text(&self) -> String {
+        let Self { training_sweeps, copies, cell_error_m, trained, .. } = self;
+        let copies = if *copies > 1 { format!(" in {copies} copies") } else { String::new() };
+        let error = cell_error_m.map(|error_m| format!(", error of cells {error_m:.1} m")).unwrap_or_default();
+        format!("{training_sweeps} sweeps{copies}, {} steps{error}", trained.steps)
+    }
+
     /// The limits of the head, in sentences.
     #[must_use]
     pub fn limits_text(&self) -> String {
-        let measured = match (&self.held_out, &self.confidence) {
-            (Some(_), Some(_)) => "",
-            (Some(_), None) => " Its confidence is not fitted: too few poses; wrong poses may be given out.",
-            (None, _) => " Its accuracy is not measured: there were too few sweeps to hold any out.",
-        };
-        format!(
-            "Roads that were not driven give no pose: drive every road, and both directions of wide ones.{measured}"
-        )
+        let roads = "Roads that were not driven give no pose: drive every road, and both directions of wide ones.";
+        let limits = [self.training_limit(), self.confidence_limit()];
+        limits.into_iter().flatten().fold(roads.to_owned(), |text, limit| text + " " + &limit)
+    }
+
+    fn training_limit(&self) -> Option<String> {
+        let error_m = self.cell_error_m.filter(|error_m| *error_m > SHORT_TRAINING_M)?;
+        Some(format!("The training was too short, the cells of its own sweeps are {error_m:.0} m off: more --minutes."))
+    }
+
+    fn confidence_limit(&self) -> Option<String> {
+        match (&self.held_out, &self.confidence) {
+            (Some(_), Some(FitReport { bad, bad_rejected, .. })) => {
+                let is_enough = *bad_rejected as f64 >= ENOUGH_REJECTED * *bad as f64;
+                (!is_enough).then(|| {
+                    format!(
+                        "Its confidence rejects only {bad_rejected} of {bad} wrong poses: wrong poses are given out."
+                    )
+                })
+            }
+            (Some(_), None) => {
+                Some("Its confidence is not fitted: too few poses; wrong poses may be given out.".into())
+            }
+            (None, _) => Some("Its accuracy is not measured: there were too few sweeps to hold any out.".into()),
+        }
     }
 }

@@ -84,6 +84,8 @@ pub struct SceneSummary {
     pub sweeps: usize,
     /// Number of cells in all batches.
     pub cells_shown: u64,
+    /// Mean error of a training cell in the last steps, metres; `None` without a step.
+    pub error_m: Option<f64>,
     /// The last validation.
     pub accuracy: Option<SceneAccuracy>,
 }

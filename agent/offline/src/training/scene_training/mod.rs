@@ -284,6 +284,7 @@ impl<'a> Training<'a> {
             scene_name: self.head_config.scene_name,
             sweeps: self.cache.sweep_count(),
             cells_shown: self.cells_shown,
+            error_m: (self.reported.steps > 0).then(|| self.reported.error_m / f64::from(self.reported.steps)),
             accuracy: self.accuracy,
         })
     }
