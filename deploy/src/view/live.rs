@@ -52,6 +52,8 @@ pub(super) struct RunStatus {
     pub(super) is_over: bool,
     /// True while there is a connection to its router.
     pub(super) has_router: bool,
+    /// Number of cameras whose images are not shown.
+    pub(super) images_left_out: usize,
 }
 
 /// State behind [`RunStatus`].
@@ -101,6 +103,7 @@ impl LiveRun {
             silent_s: activity.last_message.map(|at| at.elapsed().as_secs_f64()),
             is_over: activity.is_over,
             has_router: activity.has_router,
+            images_left_out: self.images.left_out(),
         }
     }
 

@@ -79,6 +79,29 @@ fn a_script_gives_the_precision_of_the_built_in_method_and_the_files_hold_the_fr
 }
 
 #[test]
+fn a_script_gives_the_precision_of_the_built_in_method_live() {
+    let _exclusive = exclusive_lock();
+    let folder = tempfile::tempdir().unwrap();
+    let [scene, runs] = ["scene", "runs"].map(|name| folder.path().join(name));
+    let options = SynthOptions { frames: FRAMES, ..SynthOptions::new(Subset::V2vdet, 905, scene.clone()) };
+    generate(&options, &|_| {}).unwrap();
+    let [scenario, scene, runs] =
+        [shared("scenarios/demo.yaml"), scene.display().to_string(), runs.display().to_string()];
+    let precision = |name: &str, method: &str| {
+        let arguments = ["up", &scenario, "--scene", &scene, "--runs", &runs, "--name", name, "--method", method];
+        let set = ["--set", "scene.lockstep=true", "--set", "agents.pose=recorded", "--json"];
+        let output = v2vloc(&[&arguments[..], &set[..]].concat());
+        assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stderr));
+        let metrics: Value = serde_json::from_slice(&output.stdout).unwrap();
+        ["0.3", "0.5", "0.7"].map(|iou| metrics["ap_global"][iou].as_f64().unwrap())
+    };
+    let [of_script, built_in] = [precision("script", &script()), precision("built-in", "attention")];
+    for (of_script, built_in) in of_script.into_iter().zip(built_in) {
+        assert!((of_script - built_in).abs() < 1e-4 && built_in > 0.1, "{of_script} and {built_in}");
+    }
+}
+
+#[test]
 fn a_script_runs_live_and_what_is_wrong_with_it_is_said_before_the_start() {
     let _exclusive = exclusive_lock();
     let folder = tempfile::tempdir().unwrap();

@@ -50,7 +50,8 @@ async function watch() {
 async function check() {
   const answer = await fetch("status").catch(() => null);
   if (!answer || !answer.ok) return;
-  const { silent_s: silent, is_over: over, has_router: router } = await answer.json();
+  const { silent_s: silent, is_over: over, has_router: router, images_left_out: leftOut } = await answer.json();
+  view.imagesLeftOut = leftOut;
   const before = isKnown(silent) ? ` ${seconds(silent)} ago` : "";
   if (over && silent > 2) state("over", `ended${before}${router ? "" : ", router gone"}`);
   else if (!router) state("ended", before ? `router gone, last message${before}` : "router gone");

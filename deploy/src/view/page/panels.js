@@ -3,7 +3,10 @@
 
 function facts(frame) {
   $("time").textContent = `${number(frame.capture_s, 1)} s`;
-  $("method").textContent = frame.method || (view.answered ? view.answered.method : "–");
+  const method = frame.method || (view.answered && view.answered.method) || "–";
+  // Of a TorchScript file the name, without its folder.
+  $("method").textContent = method.replace(/^script:.*\//, "script:");
+  $("method").title = method;
   $("latency").textContent = ms(frame.latency_ms);
   const { answered, ticks, rate_hz: rate } = frame.pace;
   const share = ticks ? ` (${number(100 * answered / ticks, 0)} %)` : "";
@@ -117,6 +120,8 @@ function cameras(frame) {
   $("cameras").hidden = !view.cameras.length || !chosen;
   if ($("cameras").hidden) return;
   $("cameracav").textContent = chosen;
+  $("imagesleftout").hidden = !view.imagesLeftOut;
+  $("imagesleftout").textContent = `images of ${view.imagesLeftOut} more cameras of this run are not shown`;
   const at = tape.timeline.length ? `?at=${tape.wanted}` : `?t=${frame.capture_s}`;
   view.cameras.forEach((camera, place) => {
     let image = $("images").children[place];
@@ -147,10 +152,12 @@ function messages(counted) {
   }
   const rows = [...topics].filter(([, line]) => line.sent + line.used + line.dropped > 0);
   const [used, dropped] = rows.reduce(([a, b], [, line]) => [a + line.used, b + line.dropped], [0, 0]);
+  const all = used + dropped;
   const most = rows.reduce((worst, row) => (row[1].dropped > (worst ? worst[1].dropped : 0) ? row : worst), null);
-  $("messagehead").textContent = used + dropped
-    ? `${number(100 * dropped / (used + dropped), 1)} % not used${most ? `, most of ${most[0]}: ${[...most[1].reasons].join(", ")}` : ""}`
-    : "nothing counted yet";
+  // A share says something of many only; of one topic there may be few.
+  const share = all < 100 ? `${dropped} of ${all}` : `${number(100 * dropped / all, 1)} % of ${all}`;
+  const ofMost = most && `most of ${most[0]}: ${most[1].dropped} of ${most[1].used + most[1].dropped}, ${[...most[1].reasons].join(", ")}`;
+  $("messagehead").textContent = all ? `${share} not used${most ? `; ${ofMost}` : ""}` : "nothing counted yet";
   table("messages", [["topic"], ["sent", "Published"], ["used", "Used by receivers"], ["not used", "Left out or lost, by reason"]],
     rows.map(([topic, line]) => [
       topic, line.sent, line.receivers > 1 ? `${line.used} by ${line.receivers}` : line.used,

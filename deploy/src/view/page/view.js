@@ -49,6 +49,8 @@ const view = {
   /// What was clicked: { cav } or { object } or { detection: [x, y] }.
   chosen: null,
   cameras: [],
+  /// Cameras of a live run beyond the images that the server keeps.
+  imagesLeftOut: 0,
 };
 const order = []; // vehicles, in the order in which they were first seen: a colour each
 const swatch = (cav) => {
