@@ -1,5 +1,6 @@
 //! Files of scene heads and their encoders, by path or by the name of a released one.
 
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use localization::pgc::{SceneHead, SceneHeadConfig};
@@ -57,7 +58,9 @@ pub fn head_file(head: &str) -> Result<PathBuf, HeadFileError> {
     let released = || {
         let files = folders.iter().flat_map(|folder| files_in(folder));
         let stems = files.filter_map(|file| Some(file.file_stem()?.to_str()?.strip_prefix("pgc-")?.to_owned()));
-        stems.filter(|name| name != "encoder").collect()
+        // A folder may be reached by two paths.
+        let names: BTreeSet<String> = stems.filter(|name| name != "encoder").collect();
+        names.into_iter().collect()
     };
     files
         .find(|file| file.is_file())

@@ -155,6 +155,18 @@ fn a_map_of_a_drive_finds_its_sweeps_and_reports_where_it_was_driven() {
     let whole = dataset::open(&scene).unwrap().scenarios[0].points_path(0, 3, None).unwrap();
     let located = agent(&["locate", whole.to_str().unwrap(), "--head", out_text]);
     assert_eq!(located.status.code(), Some(0), "{}", String::from_utf8_lossy(&located.stdout));
+    assert!(!String::from_utf8_lossy(&located.stderr).contains("another LiDAR"));
+    // One of fewer lasers.
+    let frame = dataset::open(&scene).unwrap().scenarios[0].load(0, 3, &LoadOptions::default()).unwrap();
+    let sparse = folder.path().join("sparse.bin");
+    let points: Vec<[f32; 4]> = frame.points.xyzi.iter().copied().step_by(4).collect();
+    fs::write(&sparse, little_endian(&points)).unwrap();
+    let located = agent(&["locate", sparse.to_str().unwrap(), "--head", out_text]);
+    let err = String::from_utf8_lossy(&located.stderr);
+    assert!(
+        err.contains(&format!("the sweeps have {} points", points.len())) && err.contains("another LiDAR"),
+        "{err}"
+    );
     let again = agent(&arguments);
     assert_eq!(again.status.code(), Some(2));
     assert!(String::from_utf8_lossy(&again.stderr).contains("it already holds a training"));

@@ -1,4 +1,4 @@
-//! Hints for sweeps that were not localized: the head may be of another place, or of another LiDAR.
+//! Hints that a head is not one for these sweeps: it may be of another place, or of another LiDAR.
 
 use std::path::Path;
 
@@ -18,7 +18,7 @@ pub fn wrong_place_hint(sweeps: u64, head: &Path, scene_map: Option<&str>) -> St
     hint(sweeps, &head.display().to_string(), place.as_deref(), scene_map)
 }
 
-/// The hint that sweeps without a pose are those of another LiDAR, if their median number of points is far from that of
+/// The hint that sweeps are those of another LiDAR, if their median number of points is far from that of
 /// the sweeps that the head was made from ([`SceneHeadConfig::sweep_points`]).
 #[must_use]
 pub fn other_lidar_hint(head_points: Option<usize>, points: &[usize]) -> Option<String> {
@@ -28,8 +28,8 @@ pub fn other_lidar_hint(head_points: Option<usize>, points: &[usize]) -> Option<
     let ratio = own as f64 / of_head.max(1) as f64;
     (!(LEAST_RATIO..=1.0 / LEAST_RATIO).contains(&ratio)).then(|| {
         format!(
-            "sweeps without a pose have {own} points (median), those that the head was made from {of_head}: another LiDAR \
-             needs a head of its own (agent map)"
+            "the sweeps have {own} points (median), those that the head was made from {of_head}: for another LiDAR it finds \
+             few poses, or wrong ones; make a head with this one (agent map)"
         )
     })
 }

@@ -109,15 +109,17 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     let encoder = args.encoder.clone().map_or_else(|| encoder_of(&head), Ok).map_err(BadInput::of)?;
     let inference = Inference { precision: args.precision, ..Inference::default() };
     let localizer = Localizer::load(&encoder, &head, inference).map_err(BadInput::of)?;
-    let (mut found, mut bad) = (0, 0);
-    // Numbers of points of the clouds without a pose.
-    let mut lost = Vec::new();
+    let (mut found, mut lost, mut bad) = (0, 0, 0);
+    let mut points = Vec::new();
     for file in clouds_at(&args.clouds) {
         let located = args.locate(&localizer, file)?;
         match (&located.error, &located.pose) {
             (Some(_), _) => bad += 1,
             (None, Some(_)) => found += 1,
-            (None, None) => lost.push(located.points),
+            (None, None) => lost += 1,
+        }
+        if located.error.is_none() {
+            points.push(located.points);
         }
         match args.json {
             true => output::line(serde_json::to_string(&located)?)?,
@@ -125,21 +127,20 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
             false => output::line(located.text())?,
         }
     }
-    if found + lost.len() + bad > 1 {
-        let lost = lost.len();
+    if found + lost + bad > 1 {
         output::note(format_args!("{found} clouds found, {lost} without a pose, {bad} cannot be read"));
     }
-    if found == 0 && !lost.is_empty() {
+    if found == 0 && lost > 0 {
         let (head, map) = (head.display(), &localizer.head_config().scene_name);
         output::note(format_args!(
             "no cloud found itself: is {head} the head of this place and this LiDAR, and were these roads driven for \
              it? Its map is {map}"
         ));
     }
-    if let Some(hint) = other_lidar_hint(localizer.head_config().sweep_points, &lost) {
+    if let Some(hint) = other_lidar_hint(localizer.head_config().sweep_points, &points) {
         output::note(hint);
     }
-    Ok(if bad > 0 { Outcome::BadInput } else { Outcome::of(!lost.is_empty()) })
+    Ok(if bad > 0 { Outcome::BadInput } else { Outcome::of(lost > 0) })
 }
 
 impl Args {
