@@ -25,8 +25,9 @@ const SCRIPTS: [(&str, &str); 4] = [
 /// Content type of scene frames.
 const BINARY: &str = "application/octet-stream";
 
-/// Shown until the first image of a camera has arrived: it is received once a page asks for it.
-const NO_IMAGE_YET: &str = r#"<svg xmlns="http://www.w3.org/2000/svg" width="16" height="10"/>"#;
+/// Shown where there is no image: live until the first one of a camera has arrived, which is received once a page asks
+/// for it; recorded where none was captured.
+const NO_IMAGE: &str = r#"<svg xmlns="http://www.w3.org/2000/svg" width="16" height="10"/>"#;
 
 /// Serves the page of a live run until dropped.
 ///
@@ -40,12 +41,7 @@ pub fn serve_live(address: SocketAddr, run: Arc<LiveRun>) -> io::Result<WebServe
         }
         "/status" => document(&json!(run.status())),
         path => match camera(path) {
-            Some((cav, number)) => match run.images().get(&cav, number) {
-                None => {
-                    Answer::Page { content_type: "image/svg+xml", body: Bytes::from_static(NO_IMAGE_YET.as_bytes()) }
-                }
-                found => image(found),
-            },
+            Some((cav, number)) => image(run.images().get(&cav, number)),
             None => asset(request),
         },
     })
@@ -90,7 +86,7 @@ fn image(found: Option<(ImageFormat, Bytes)>) -> Answer {
     match found {
         Some((ImageFormat::Png, body)) => Answer::Page { content_type: "image/png", body },
         Some((ImageFormat::Jpeg, body)) => Answer::Page { content_type: "image/jpeg", body },
-        None => Answer::NotFound("there is no image of this camera".into()),
+        None => Answer::Page { content_type: "image/svg+xml", body: Bytes::from_static(NO_IMAGE.as_bytes()) },
     }
 }
 

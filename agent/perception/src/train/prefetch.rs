@@ -1,7 +1,7 @@
 //! Prefetching: threads that prepare batches ahead of a training.
 
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
-use std::thread;
+use std::thread::{self, JoinHandle};
 
 use super::error::TrainingError;
 
@@ -11,10 +11,12 @@ const AHEAD: usize = 3;
 /// An endless sequence of batches, each a function of its number alone, so the same for any number of threads.
 ///
 /// Thread k of T prepares batches k, k + T, k + 2T and so on into a queue of its own, and the queues are read in turn:
-/// that keeps the order without synchronisation between threads. They end when this is dropped.
+/// that keeps the order without synchronisation between threads. Dropping this ends them after the batch that they are
+/// preparing: none computes while the program exits.
 #[derive(Debug)]
 pub struct Prefetch<T> {
     queues: Vec<Receiver<T>>,
+    threads: Vec<JoinHandle<()>>,
     next: usize,
 }
 
@@ -22,14 +24,15 @@ impl<T: Send + 'static> Prefetch<T> {
     /// Starts `threads` threads; `prepare` gets the numbers of batches from `first` on.
     #[must_use]
     pub fn start(threads: usize, first: u64, prepare: impl FnMut(u64) -> T + Clone + Send + 'static) -> Self {
-        let threads = threads.max(1);
-        let queues = (0..threads).map(|thread| {
-            let (sender, receiver) = sync_channel(AHEAD);
-            let prepare = prepare.clone();
-            thread::spawn(move || work(prepare, first + thread as u64, threads, &sender));
-            receiver
-        });
-        Self { queues: queues.collect(), next: 0 }
+        let count = threads.max(1);
+        let (queues, threads) = (0..count)
+            .map(|thread| {
+                let (sender, receiver) = sync_channel(AHEAD);
+                let prepare = prepare.clone();
+                (receiver, thread::spawn(move || work(prepare, first + thread as u64, count, &sender)))
+            })
+            .unzip();
+        Self { queues, threads, next: 0 }
     }
 
     /// The next batch.
@@ -40,6 +43,17 @@ impl<T: Send + 'static> Prefetch<T> {
         let queue = self.next;
         self.next = (queue + 1) % self.queues.len();
         self.queues[queue].recv().map_err(|_| TrainingError::LoaderGone)
+    }
+}
+
+impl<T> Drop for Prefetch<T> {
+    fn drop(&mut self) {
+        // A thread ends when nobody takes its batch.
+        self.queues.clear();
+        for thread in self.threads.drain(..) {
+            // A panic has been reported, and `next_batch` has returned an error.
+            let _ = thread.join();
+        }
     }
 }
 

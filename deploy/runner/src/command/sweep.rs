@@ -1,6 +1,7 @@
 //! `v2vloc sweep`.
 
-use std::path::PathBuf;
+use std::fs;
+use std::path::{Path, PathBuf};
 
 use runner::experiment::sweep::{Experiment, Sweep, SweepOptions};
 use support::output;
@@ -43,8 +44,19 @@ impl Arguments {
         let swept = sweep.run(&options)?;
         output::text(&swept.table)?;
         if !self.dry_run {
+            note_maps(&out.join("maps"));
             output::note(format_args!("report {}", out.join("report.html").display()));
         }
         Ok(left_out(swept.left_out.iter()))
+    }
+}
+
+/// Names the size of the feature maps, which are most of what a sweep leaves.
+fn note_maps(folder: &Path) {
+    let files = fs::read_dir(folder).into_iter().flatten().flatten();
+    let bytes: u64 = files.filter_map(|file| Some(file.metadata().ok()?.len())).sum();
+    if bytes > 0 {
+        let megabytes = bytes as f64 / 1e6;
+        output::note(format_args!("{megabytes:.1} MB of feature maps in {}, for the next runs", folder.display()));
     }
 }
