@@ -128,7 +128,7 @@ impl MapReport {
                 let is_enough = *bad_rejected as f64 >= ENOUGH_REJECTED * *bad as f64;
                 (!is_enough).then(|| {
                     format!(
-                        "Its confidence rejects only {bad_rejected} of {bad} wrong poses: wrong poses are given out."
+                        "Its confidence rejects only {bad_rejected} of {bad} wrong poses: others are given out, mostly with low confidence."
                     )
                 })
             }
