@@ -155,7 +155,11 @@ fn sent(
     let mut agents = Vec::new();
     for cav in scenario.agents.iter().take(vehicles) {
         let source = PoseSourceConfig::Recorded.for_scenario(&scenario.name).build(Inference::default())?;
-        agents.push(Agent::new(cav.clone(), source, Detector::from_weights(weights, &weights.config()?, Device::Cpu)?));
+        agents.push(Agent::new(
+            cav.clone(),
+            source,
+            Detector::from_weights(weights, &weights.detector_config()?, Device::Cpu)?,
+        ));
     }
     let mut all = Vec::with_capacity(frames);
     for tick in 0..frames {

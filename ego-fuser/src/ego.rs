@@ -86,7 +86,7 @@ impl Ego {
             (None, Some(name)) => name.parse()?,
             (None, None) => Method::NONE,
         };
-        let detector = Detector::from_weights(weights, &weights.config()?, device)?;
+        let detector = Detector::from_weights(weights, &weights.detector_config()?, device)?;
         let fusion = FusionStage::from_weights(weights, method, detector.config(), device)?;
         Ok(Self::assembled(detector, method, fusion))
     }

@@ -137,7 +137,7 @@ fn recorded_map(model: &str, folder: &Path, dtype: Dtype) -> Result<(PathBuf, En
     let scenario = dataset::open(&folder.join("scene"))?.scenarios.remove(0);
     let frame = scenario.load(0, 0, &LoadOptions::default())?;
     let weights = Weights::load(&file)?;
-    let detector = Detector::from_weights(&weights, &weights.config()?, Device::Cpu)?;
+    let detector = Detector::from_weights(&weights, &weights.detector_config()?, Device::Cpu)?;
     let mut agent = Agent::new(cav(0), Box::new(RecordedPose), detector);
     let input = AgentInput {
         capture_nanos: frame.capture_nanos,

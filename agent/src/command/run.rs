@@ -52,7 +52,8 @@ pub(crate) fn run(args: Args) -> anyhow::Result<()> {
 fn agent(config: &AgentConfig) -> anyhow::Result<Agent> {
     let inference = config.models.inference()?;
     let weights = config.models.load(inference).context("weights")?;
-    let detector = Detector::from_weights(&weights, &weights.config()?, inference.device).context("weights")?;
+    let detector =
+        Detector::from_weights(&weights, &weights.detector_config()?, inference.device).context("weights")?;
     Ok(Agent::new(config.cav.clone(), config.settings.pose.build(inference)?, detector))
 }
 

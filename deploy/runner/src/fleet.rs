@@ -75,7 +75,7 @@ impl Fleet {
     pub fn plan(scenario: &Scenario) -> Result<Self, FleetError> {
         let mut scenario = scenario.clone();
         scenario.models.weights = weights_of(&scenario.models.weights, scenario.method)?;
-        let detector = Weights::load(&scenario.models.weights)?.config()?;
+        let detector = Weights::load(&scenario.models.weights)?.detector_config()?;
         scenario.poses().iter().try_for_each(load_networks)?;
         if let Some(link) = &scenario.link {
             LinkEmulator::open(&link.model, link.seed)?;

@@ -138,7 +138,7 @@ impl CooperativeModel {
             (None, Some(name)) => name.parse()?,
             (None, None) => Method::NONE,
         };
-        let config = weights.config()?;
+        let config = weights.detector_config()?;
         let fusion = match fusion {
             Some(fusion) => fusion.clone(),
             None => stored_config(weights, method, &config)?,

@@ -78,7 +78,7 @@ impl AlignmentMeter {
     /// [`EgoError`] names the file and what is wrong with it.
     pub fn load(weights: &Weights) -> Result<Self, EgoError> {
         let method = weights.metadata(METHOD_KEY).unwrap_or(Method::NONE.name()).parse()?;
-        let detector = Detector::from_weights(weights, &weights.config()?, Device::Cpu)?;
+        let detector = Detector::from_weights(weights, &weights.detector_config()?, Device::Cpu)?;
         let fusion = FusionStage::from_weights(weights, method, detector.config(), Device::Cpu)?;
         Ok(Self { detector, fusion })
     }

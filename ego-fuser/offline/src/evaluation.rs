@@ -254,7 +254,7 @@ impl Evaluator {
         };
         // Messages of the ego's own vehicle are not transmitted on the link.
         let rate = if is_ego { RateConfig::default() } else { own.map_or(self.config.rate, |own| own.rate) };
-        let detector = Detector::from_weights(&self.weights, &self.weights.config()?, Device::Cpu)?;
+        let detector = Detector::from_weights(&self.weights, &self.weights.detector_config()?, Device::Cpu)?;
         let place = scenario.agents.iter().position(|agent| agent == cav).unwrap_or(0);
         let attack = match own.and_then(|own| own.falsification) {
             Some(falsification) => Some(Attack::new(falsification, cav, 0)),

@@ -51,7 +51,7 @@ fn observe_detector(
     left_out: &mut LeftOut,
 ) -> Result<(), EvaluateError> {
     let weights = Weights::load(weights)?.with_precision(InferencePrecision::Float);
-    let mut detector = Detector::from_weights(&weights, &weights.config()?, Device::Cpu)?;
+    let mut detector = Detector::from_weights(&weights, &weights.detector_config()?, Device::Cpu)?;
     for scenario in scenarios {
         for tick in 0..scenario.ticks.len().min(frames) {
             let loaded = scenario.load_tick(tick, 0..scenario.agents.len(), &LoadOptions::default());

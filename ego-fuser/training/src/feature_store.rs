@@ -288,7 +288,7 @@ impl MapSource {
         let encoder = match &mut self.encoder {
             Some(encoder) => encoder,
             None => {
-                let config = self.weights.config()?;
+                let config = self.weights.detector_config()?;
                 self.encoder.insert(Detector::from_weights(&self.weights, &config, Device::Cpu)?)
             }
         };

@@ -60,7 +60,7 @@ impl Detector {
     /// [`DetectorError`] names the file, the tensor and both shapes.
     pub fn load(path: &Path, device: Device) -> Result<Self, DetectorError> {
         let weights = Weights::load(path)?;
-        Self::from_weights(&weights, &weights.config()?, device)
+        Self::from_weights(&weights, &weights.detector_config()?, device)
     }
 
     /// Builds the detector that `config` describes from a file already read; on the CPU in integers if it has

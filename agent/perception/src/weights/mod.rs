@@ -20,6 +20,7 @@ use tch::Tensor;
 use tch::nn::VarStore;
 
 use crate::int8::{ActivationScales, InferencePrecision, QuantiseError, SCALES_KEY};
+use crate::model_config::DetectorConfig;
 
 pub use annotate::annotate;
 pub use error::WeightsError;
@@ -137,6 +138,15 @@ impl Weights {
     /// See [`Self::metadata_json`].
     pub fn config<T: DeserializeOwned>(&self) -> Result<T, WeightsError> {
         self.metadata_json(CONFIG_KEY)
+    }
+
+    /// Configuration of a detector.
+    ///
+    /// # Errors
+    /// [`WeightsError::Kind`] when the file names another kind of network; see [`Self::metadata_json`].
+    pub fn detector_config(&self) -> Result<DetectorConfig, WeightsError> {
+        self.check_kind("detector")?;
+        self.config()
     }
 
     /// The JSON under a metadata key.
@@ -257,7 +267,6 @@ mod tests {
     use tch::Device;
 
     use super::*;
-    use crate::model_config::DetectorConfig;
     use crate::pillars::point_pillars::PointPillars;
 
     fn small() -> DetectorConfig {
@@ -289,13 +298,24 @@ mod tests {
         let sha256 = save(&path, &first, &metadata(&config), Precision::Single).unwrap();
         let weights = Weights::load(&path).unwrap();
         assert_eq!(weights.sha256(), sha256);
-        assert_eq!(weights.config::<DetectorConfig>().unwrap(), config);
+        assert_eq!(weights.detector_config().unwrap(), config);
         let is_head = |name: &str| name.starts_with("cls_head");
         assert_ne!(weights.sha256_of(is_head), weights.sha256_of(|name| !is_head(name)));
         let second = network(&config);
         weights.copy_into(&second).unwrap();
         let copies = second.variables();
         assert!(first.variables().iter().all(|(name, tensor)| tensor.equal(&copies[name])));
+    }
+
+    #[test]
+    fn another_kind_of_network_is_named_before_its_configuration_is_read() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("encoder.safetensors");
+        let about = [(CONFIG_KEY, r#"{"voxel_m": 0.5}"#), (KIND_KEY, "scene encoder")];
+        let about = about.map(|(key, value)| (key.to_owned(), value.to_owned())).into();
+        save(&path, &network(&small()), &about, Precision::Single).unwrap();
+        let message = Weights::load(&path).unwrap().detector_config().unwrap_err().to_string();
+        assert!(message.contains("\"scene encoder\"") && message.contains("\"detector\""), "{message}");
     }
 
     #[test]

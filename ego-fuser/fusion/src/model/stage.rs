@@ -11,6 +11,7 @@ use protocol::{BevGrid, Pose};
 use tch::nn::{self, VarStore};
 use tch::{Device, TchError, Tensor};
 
+use super::METHOD_KEY;
 use crate::channel_mixing::{self, ChannelMixing};
 use crate::classes::Classes;
 use crate::f64_tensor::{Order, are_numbers};
@@ -33,6 +34,16 @@ pub enum StageError {
     /// The weights do not fit.
     #[error(transparent)]
     Weights(#[from] WeightsError),
+    /// The weights of another method do not fit.
+    #[error("{source}; the file was trained for method {trained}, not {method}")]
+    OtherMethod {
+        /// Method in the file.
+        trained: String,
+        /// Required method.
+        method: &'static str,
+        /// Tensor that does not fit.
+        source: Box<WeightsError>,
+    },
 }
 
 /// Channel mixing, warp and fusion of one network.
@@ -91,7 +102,8 @@ impl FusionStage {
         let variables = VarStore::new(device);
         let config = stored_config(weights, method, detector)?;
         let mut stage = Self::new(&variables.root(), &config, method, detector)?;
-        weights.copy_some_into(&variables, |name| name != channel_mixing::WEIGHT || weights.contains(name))?;
+        let is_needed = |name: &str| name != channel_mixing::WEIGHT || weights.contains(name);
+        weights.copy_some_into(&variables, is_needed).map_err(|error| of_method(error, weights, method))?;
         if !weights.contains(channel_mixing::WEIGHT) {
             stage.mixing = None;
         }
@@ -313,6 +325,16 @@ fn cell_by_cell(maps: &Tensor) -> Result<Tensor, TchError> {
     }
 }
 
+/// Names the method of the weights beside an error, if it is another one.
+fn of_method(error: WeightsError, weights: &Weights, method: Method) -> StageError {
+    match weights.metadata(METHOD_KEY) {
+        Some(trained) if trained != method.name() => {
+            StageError::OtherMethod { trained: trained.to_owned(), method: method.name(), source: Box::new(error) }
+        }
+        _ => error.into(),
+    }
+}
+
 /// The configuration that a weights file names, as long as it belongs to `method`.
 pub(crate) fn stored_config(
     weights: &Weights,
@@ -329,6 +351,7 @@ pub(crate) fn stored_config(
 
 #[cfg(test)]
 mod tests {
+    use perception::weights::{Precision, save};
     use tch::Kind;
 
     use super::*;
@@ -353,6 +376,23 @@ mod tests {
         let here = fused(&plain, &maps);
         let there = fused(&mirrored, &maps.flip([2])).flip([1]);
         assert!(here.allclose(&there, 1e-3, 1e-3, false));
+    }
+
+    #[test]
+    fn weights_of_another_method_are_named() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("weights.safetensors");
+        let detector = DetectorConfig::lean();
+        let variables = VarStore::new(Device::Cpu);
+        let attention = Method::ATTENTION;
+        FusionStage::new(&variables.root(), &attention.default_fusion(&detector), attention, &detector).unwrap();
+        let about = [(METHOD_KEY.to_owned(), attention.name().to_owned())].into();
+        save(&path, &variables, &about, Precision::Single).unwrap();
+        let weights = Weights::load(&path).unwrap();
+        let error = FusionStage::from_weights(&weights, Method::COBEVT, &detector, Device::Cpu).unwrap_err();
+        let message = error.to_string();
+        assert!(message.starts_with(&path.display().to_string()), "{message}");
+        assert!(message.ends_with("; the file was trained for method attention, not cobevt"), "{message}");
     }
 
     #[test]

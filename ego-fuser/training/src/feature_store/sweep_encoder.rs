@@ -60,7 +60,7 @@ impl SweepEncoder {
         let detector = match &mut self.detector {
             Some(detector) => detector,
             None => {
-                let config = self.weights.config()?;
+                let config = self.weights.detector_config()?;
                 self.detector.insert(Detector::from_weights(&self.weights, &config, Device::Cpu)?)
             }
         };
