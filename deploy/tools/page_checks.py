@@ -211,6 +211,7 @@ class RecordedPage(Checks):
         tab.click_on("#card button")
         self.click_drawn("probe.detections()")
         self.becomes("a detection is selected", "#card", "Detection.*score0\\.\\d\\d")
+        self.becomes("the pointer on a detection shows its score", "#tip", "score 0\\.\\d\\d")
 
     def click_drawn(self, strokes: str) -> None:
         """Clicks on one of what was drawn, the furthest from the middle: there no vehicle is in front of a box."""

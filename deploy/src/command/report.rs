@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use deploy::operate::status::RunStatus;
-use deploy::report::RunReport;
+use deploy::report::{Comparison, RunReport};
 use support::output;
 
 use support::cli::BadInput;
@@ -11,20 +11,29 @@ use support::cli::Outcome;
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct Arguments {
-    /// Folder of a run that has ended, or its name in --runs [default: the newest in --runs].
-    run: Option<PathBuf>,
+    /// Folder of a run that has ended, or its name in --runs; several are compared [default: the newest in --runs].
+    #[arg(value_name = "RUN")]
+    named: Vec<PathBuf>,
     /// Folder of the run folders.
     #[arg(long, default_value = "runs")]
     runs: PathBuf,
-    /// Print report.json instead of tables: times in milliseconds, CPU in seconds, sizes in bytes.
+    /// Print report.json (a list of them for several runs) instead of tables: times in milliseconds, CPU in seconds, sizes in bytes.
     #[arg(long)]
     json: bool,
 }
 
 impl Arguments {
-    /// Prints the report of the run.
+    /// Prints the report of the run, or a comparison of several.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
-        let folder = RunStatus::folder(self.run, &self.runs).map_err(BadInput::of)?;
+        match self.named.as_slice() {
+            [] => self.print(None),
+            [run] => self.print(Some(run.clone())),
+            several => self.compare(several),
+        }
+    }
+
+    fn print(&self, run: Option<PathBuf>) -> anyhow::Result<Outcome> {
+        let folder = RunStatus::folder(run, &self.runs).map_err(BadInput::of)?;
         let report = RunReport::read(&folder).map_err(BadInput::of)?;
         if self.json {
             output::line(serde_json::to_string_pretty(&report)?)?;
@@ -33,6 +42,18 @@ impl Arguments {
                 "run       {}, {} with {} poses, {} clock\n{report}",
                 report.run, report.method, report.pose_source, report.clock
             ))?;
+        }
+        Ok(Outcome::Done)
+    }
+
+    fn compare(&self, several: &[PathBuf]) -> anyhow::Result<Outcome> {
+        let folder = |run: &PathBuf| RunStatus::folder(Some(run.clone()), &self.runs);
+        let folders = several.iter().map(folder).collect::<Result<Vec<_>, _>>().map_err(BadInput::of)?;
+        if self.json {
+            let reports = folders.iter().map(|folder| RunReport::read(folder)).collect::<Result<Vec<_>, _>>();
+            output::line(serde_json::to_string_pretty(&reports.map_err(BadInput::of)?)?)?;
+        } else {
+            output::text(Comparison::read(&folders).map_err(BadInput::of)?)?;
         }
         Ok(Outcome::Done)
     }

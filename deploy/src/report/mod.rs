@@ -1,6 +1,7 @@
 //! `report.json`: pace, latency, stages, CPU, memory and bytes of a run that has ended.
 
 mod capacity;
+mod comparison;
 mod pace;
 mod resources;
 mod text;
@@ -13,6 +14,7 @@ use support::bounded_file;
 use support::statistics::{quantile, sorted};
 
 pub use capacity::{Capacity, Machine};
+pub use comparison::Comparison;
 pub use pace::{AgentPace, Pace};
 pub use resources::{ProcessResources, StageTimes, StreamBytes};
 

@@ -150,3 +150,27 @@ fn a_run_without_processes_has_pace_and_latency_only() {
     let text = RunReport::new(&"r1".parse().unwrap(), &metrics, &records, &[], None).to_string();
     assert!(text.contains("answered 2/2 (100 %)") && !text.contains("stage") && !text.contains("computed"), "{text}");
 }
+
+#[test]
+fn runs_are_compared_column_by_column() {
+    let runs = tempfile::tempdir().unwrap();
+    let folders = ["one", "two"].map(|name| runs.path().join(name));
+    for (folder, answered) in folders.iter().zip([3, 4]) {
+        std::fs::create_dir(folder).unwrap();
+        let name = folder.file_name().unwrap().to_string_lossy().into_owned();
+        let report = RunReport { run: name, ..report() };
+        let metrics = Metrics { ticks: 4, answered, ..metrics("pastat") };
+        std::fs::write(folder.join(FILE), serde_json::to_string(&report).unwrap()).unwrap();
+        std::fs::write(folder.join("metrics.json"), serde_json::to_string(&metrics).unwrap()).unwrap();
+    }
+    let text = Comparison::read(&folders).unwrap().to_string();
+    let lines: Vec<&str> = text.lines().collect();
+    assert!(lines[0].starts_with("run") && lines[0].contains("one") && lines[0].ends_with("two"), "{text}");
+    let latency = lines.iter().find(|line| line.starts_with("latency, median, ms")).unwrap();
+    assert_eq!(latency.split_whitespace().rev().take(2).collect::<Vec<_>>(), ["100", "100"], "{text}");
+    assert!(text.contains("Runs answered different ticks"), "{text}");
+
+    std::fs::remove_file(folders[1].join("metrics.json")).unwrap();
+    let message = Comparison::read(&folders).unwrap_err().to_string();
+    assert!(message.contains("two/metrics.json"), "{message}");
+}

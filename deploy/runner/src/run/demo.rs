@@ -9,6 +9,9 @@ use protocol::{CavId, Pose};
 use crate::fleet::Fleet;
 use crate::run::picture::{Picture, View};
 
+/// Margin around boxes and vehicles, metres.
+const MARGIN_M: f64 = 12.0;
+
 /// Draws that frame of a run. A picture that cannot be drawn is a warning: the run itself is complete.
 pub fn draw(fleet: &Fleet, board: &FrameScores, path: &Path) -> Option<PathBuf> {
     let frame = board.showpiece()?;
@@ -40,11 +43,17 @@ fn try_draw(fleet: &Fleet, frame: &JudgedFrame, path: &Path) -> Result<(), Box<d
         loaded.push((cav.to_string(), world_from_ego.from_world(&world_from_cav), recorded.points.xyzi));
     }
     let rule = fleet.ground_truth_rule();
-    let detections = frame.result.detections.iter().map(|detection| (detection.box3d, detection.score)).collect();
+    let detections: Vec<_> =
+        frame.result.detections.iter().map(|detection| (detection.box3d, detection.score)).collect();
+    let places = |axis: usize| {
+        let boxes = frame.truth.iter().chain(detections.iter().map(|(found, _)| found));
+        let vehicles = loaded.iter().map(move |(_, ego_from_cav, _)| ego_from_cav.translation_m[axis]);
+        boxes.map(move |shape| shape.center_m[axis]).chain(vehicles)
+    };
     Picture {
-        title: format!("{}  tick {}  {}", fleet.scenario.method, frame.tick, scenario.name),
-        x_m: rule.x_m,
-        y_m: rule.y_m,
+        title: format!("{}  tick {}, that with most neighbours  {}", fleet.scenario.method, frame.tick, scenario.name),
+        x_m: around(places(0), rule.x_m),
+        y_m: around(places(1), rule.y_m),
         views: loaded
             .iter()
             .map(|(name, ego_from_cav, xyzi)| View { name: name.clone(), ego_from_cav: *ego_from_cav, xyzi })
@@ -54,4 +63,27 @@ fn try_draw(fleet: &Fleet, frame: &JudgedFrame, path: &Path) -> Result<(), Box<d
     }
     .save(path)?;
     Ok(())
+}
+
+/// Range of the places and a margin around it, metres, within a limit: the rest of the limit is empty.
+fn around(places: impl Iterator<Item = f64>, [low, high]: [f64; 2]) -> [f64; 2] {
+    let (first, last) = places
+        .filter(|place| (low..=high).contains(place))
+        .fold((f64::INFINITY, f64::NEG_INFINITY), |(first, last), place| (first.min(place), last.max(place)));
+    if first > last {
+        return [low, high];
+    }
+    [(first - MARGIN_M).max(low), (last + MARGIN_M).min(high)]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_picture_shows_what_is_there_within_the_evaluated_area() {
+        assert_eq!(around([3.0, -20.0, 500.0, f64::NAN].into_iter(), [-140.0, 140.0]), [-32.0, 15.0]);
+        assert_eq!(around([-45.0, 30.0].into_iter(), [-40.0, 40.0]), [18.0, 40.0]);
+        assert_eq!(around([].into_iter(), [-40.0, 40.0]), [-40.0, 40.0]);
+    }
 }

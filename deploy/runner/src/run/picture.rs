@@ -21,6 +21,8 @@ const MIN_WIDTH: u32 = 760;
 const MAX_SIDE: f64 = 8_192.0;
 /// Largest distance of a drawn box's corners from the plan view, metres.
 const BOX_MARGIN_M: f64 = 50.0;
+/// Width and height of a written score, pixels.
+const SCORE_SIZE: [f64; 2] = [34.0, 16.0];
 /// Height in the LiDAR's frame below which points are ground (about 1.9 m below the LiDAR), metres.
 const GROUND_Z_M: f64 = -1.5;
 
@@ -122,9 +124,11 @@ impl Picture<'_> {
         for truth in &self.truth {
             self.draw_box(truth, TRUTH, &plane)?;
         }
-        for (found, score) in &self.detections {
+        for (found, _) in &self.detections {
             self.draw_box(found, DETECTION, &plane)?;
-            self.draw_score(found, *score, &plane)?;
+        }
+        for (found, score) in self.labelled() {
+            self.draw_score(found, score, &plane)?;
         }
         for (view, colour) in self.coloured_views() {
             self.draw_position(view, colour, &plane)?;
@@ -180,6 +184,24 @@ impl Picture<'_> {
         let front = [0, 1].map(|axis| (corners[0][axis] + corners[1][axis]) / 2.0);
         let [x, y, _] = shape.center_m;
         Ok(plane.draw(&PathElement::new([(x, y), (front[0], front[1])], stroke(colour)))?)
+    }
+
+    /// Detections whose score is written: the highest ones first, and none over another.
+    fn labelled(&self) -> Vec<(&Box3d, f32)> {
+        let mut by_score: Vec<_> = self.detections.iter().map(|(found, score)| (found, *score)).collect();
+        by_score.sort_by(|(_, a), (_, b)| b.total_cmp(a));
+        let mut labelled: Vec<(&Box3d, f32)> = Vec::new();
+        for (found, score) in by_score {
+            let [x, y, _] = found.center_m;
+            let covers = |(other, _): &(&Box3d, f32)| {
+                let [across, up] = [other.center_m[0] - x, other.center_m[1] - y].map(f64::abs);
+                across * PIXELS_PER_M < SCORE_SIZE[0] && up * PIXELS_PER_M < SCORE_SIZE[1]
+            };
+            if !labelled.iter().any(covers) {
+                labelled.push((found, score));
+            }
+        }
+        labelled
     }
 
     fn draw_score(&self, found: &Box3d, score: f32, plane: &Plane<'_>) -> Result<(), FigureError> {
@@ -292,6 +314,13 @@ mod tests {
         assert!(shows(&pixels, [20.0, 11.0], TRUTH), "left side of the true box");
         assert!(shows(&pixels, [-18.0, -10.5], DETECTION), "front of the detection");
         assert!(shows(&pixels, [33.0, -13.0], BACKGROUND));
+    }
+
+    #[test]
+    fn of_detections_upon_each_other_the_highest_score_is_written() {
+        let detections = vec![(car(0.0, 0.0), 0.3), (car(1.0, 0.5), 0.9), (car(10.0, 0.0), 0.2)];
+        let picture = Picture { detections, ..picture(&[]) };
+        assert_eq!(picture.labelled().iter().map(|(_, score)| *score).collect::<Vec<_>>(), [0.9, 0.2]);
     }
 
     #[test]

@@ -198,6 +198,29 @@ function at(u, v) {
   return object ? { object: object.id } : null;
 }
 
+/// What is under the pointer, in a few words.
+function described(what) {
+  if (what.box) return `score ${number(what.box.score, 2)}`;
+  if (what.cav) {
+    const { confidence, ...vehicle } = view.frame.vehicles.find(({ cav }) => cav === what.cav);
+    return isKnown(confidence) ? `${what.cav}: σ ${metres(sigma({ confidence, ...vehicle }))}` : what.cav;
+  }
+  const object = (results().of || view.frame).truth.find(({ id }) => id === what.object);
+  const found = isKnown(object.found_score) ? `found with score ${number(object.found_score, 2)}` : "missed";
+  return `${words(object.class)}: ${object.is_counted ? found : "not counted"}`;
+}
+
+/// Shows it beside the pointer; `null` hides it.
+function tip(position) {
+  const what = position && at(...position);
+  $("tip").hidden = !what;
+  if (!what) return;
+  $("tip").textContent = described(what);
+  const left = Math.min(position[0] + 14, canvas.clientWidth - $("tip").offsetWidth - 4);
+  $("tip").style.left = `${left}px`;
+  $("tip").style.top = `${Math.max(4, position[1] - 30)}px`;
+}
+
 /// World position of a position of the canvas: the inverse of `place` in `draw`.
 function unplace(u, v) {
   const [cosine, sine] = [Math.cos(view.turn), Math.sin(view.turn)];
@@ -209,6 +232,10 @@ function unplace(u, v) {
 // ---- navigation ----
 
 let pressed = null;
+const inCanvas = (event) => {
+  const { left, top } = canvas.getBoundingClientRect();
+  return [event.clientX - left, event.clientY - top];
+};
 
 const fingers = new Map();
 canvas.addEventListener("pointerdown", (event) => {
@@ -219,11 +246,13 @@ canvas.addEventListener("pointerdown", (event) => {
 canvas.addEventListener("pointerup", (event) => {
   const isClick = pressed && Math.hypot(event.clientX - pressed[0], event.clientY - pressed[1]) < 5;
   if (!isClick) return;
-  const { left, top } = canvas.getBoundingClientRect();
-  choose(at(event.clientX - left, event.clientY - top));
+  choose(at(...inCanvas(event)));
 });
+canvas.addEventListener("pointerleave", () => tip(null));
 canvas.addEventListener("pointermove", (event) => {
   const before = fingers.get(event.pointerId);
+  // A finger has no place where it does not press.
+  tip(before || event.pointerType === "touch" ? null : inCanvas(event));
   if (!before) return;
   const apart = () => { const [a, b] = [...fingers.values()]; return Math.hypot(a[0] - b[0], a[1] - b[1]); };
   const wide = fingers.size > 1 ? apart() : 0;
