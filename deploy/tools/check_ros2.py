@@ -291,7 +291,7 @@ def check_robot(programs, client, bodies, poses):
     client.subscribe("/cav_robot/pose", "geometry_msgs/msg/PoseWithCovarianceStamped")
     where = {"domain_id": DOMAIN, "router_ip": "127.0.0.1", "router_port": client.port}
     wait_for("the subscription", lambda: get_topic_info("/velodyne_points", **where))
-    wait_for("the agent", lambda: get_topic_info("/cav_robot/pose", **where).publisher_count)
+    wait_for("the agent", lambda: (topic := get_topic_info("/cav_robot/pose", **where)) and topic.publisher_count)
     name = "sensor_msgs/msg/PointCloud2"
     publisher = ROS2Publisher(
         "/velodyne_points", name, msg_definition=client.types.definition(name), type_hash=client.types.hash(name),
