@@ -243,8 +243,10 @@ fn print(report: &NodeReport, as_json: bool) -> anyhow::Result<()> {
     if lidar.sweeps_without_motion > 0 {
         output::line(format_args!("{} of these without a motion", lidar.sweeps_without_motion))?;
     }
-    for (topic, MotionReport { read, unreadable }) in &report.motion {
-        output::line(format_args!("{read} messages of {topic} read, {unreadable} could not be read"))?;
+    for (topic, MotionReport { read, unreadable, out_of_order }) in &report.motion {
+        output::line(format_args!(
+            "{read} messages of {topic} read, {unreadable} could not be read, {out_of_order} measurements out of order"
+        ))?;
     }
     if lidar.unreadable > 0 {
         output::line(format_args!("{} messages of LiDARs could not be read", lidar.unreadable))?;

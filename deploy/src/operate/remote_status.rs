@@ -7,7 +7,7 @@ use bus::bounded_queue::Pop;
 use bus::{Bus, BusError, present};
 use protocol::{CavId, Detections, KeyExpr, Limits, Stats, Stream, Topic, wire};
 use serde::Serialize;
-use support::text_table::{Side, TextTable};
+use support::text_table::{Side, TextTable, number};
 
 /// Queued messages of a topic.
 const PLACES: usize = 64;
@@ -132,10 +132,6 @@ impl RemoteStatus {
 
 fn result_line(RemoteEgo { ego, rate_hz, latency_ms, fused }: &RemoteEgo) -> String {
     format!("ego {ego}: {rate_hz:.1} results a second, latency {} ms, {fused} fused\n", number(*latency_ms, 0))
-}
-
-fn number(value: Option<f64>, digits: usize) -> String {
-    value.map_or("-".into(), |value| format!("{value:.digits$}"))
 }
 
 /// Messages seen so far.

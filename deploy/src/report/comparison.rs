@@ -3,15 +3,11 @@
 use std::fmt;
 use std::path::Path;
 
-use support::bounded_file;
-use support::text_table::{Side, TextTable};
+use support::text_table::{Side, TextTable, number};
 
-use super::{MAX_BYTES, ReportError, RunReport};
+use super::{ReportError, RunReport, read_json};
 use crate::operate::progress::bytes;
-use crate::score::metrics::Metrics;
-
-/// File of the metrics in the folder of a run.
-const METRICS: &str = "metrics.json";
+use crate::score::metrics::{self, Metrics};
 
 /// Runs that are compared.
 #[derive(Debug)]
@@ -48,16 +44,9 @@ impl Comparison {
     /// # Errors
     /// [`ReportError`] names the file.
     pub fn read(folders: &[impl AsRef<Path>]) -> Result<Self, ReportError> {
-        let read = |folder: &Path| Ok((RunReport::read(folder)?, metrics(folder)?));
+        let read = |folder: &Path| Ok((RunReport::read(folder)?, read_json(folder.join(metrics::FILE))?));
         folders.iter().map(|folder| read(folder.as_ref())).collect::<Result<_, _>>().map(Self)
     }
-}
-
-fn metrics(folder: &Path) -> Result<Metrics, ReportError> {
-    let path = folder.join(METRICS);
-    let text =
-        bounded_file::read_text(&path, MAX_BYTES).map_err(|source| ReportError::Read { path: path.clone(), source })?;
-    serde_json::from_str(&text).map_err(|error| ReportError::Syntax { path, problem: error.to_string() })
 }
 
 impl fmt::Display for Comparison {
@@ -70,12 +59,8 @@ impl fmt::Display for Comparison {
         }
         write!(f, "{table}")?;
         if self.0.windows(2).any(|pair| pair[0].1.answered != pair[1].1.answered) {
-            writeln!(f, "\nRuns answered different ticks: compare \"AP@0.5 all\" and sAP@0.5.")?;
+            writeln!(f, "\nRuns answered different numbers of ticks: compare \"AP@0.5 all\" and sAP@0.5.")?;
         }
         Ok(())
     }
-}
-
-fn number(value: Option<f64>, digits: usize) -> String {
-    value.map_or("-".into(), |value| format!("{value:.digits$}"))
 }

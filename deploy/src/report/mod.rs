@@ -9,6 +9,7 @@ mod text;
 use std::path::{Path, PathBuf};
 
 use protocol::RunId;
+use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use support::bounded_file;
 use support::statistics::{quantile, sorted};
@@ -81,7 +82,7 @@ pub enum ReportError {
         /// Error of the operating system.
         source: std::io::Error,
     },
-    /// The file is no report.
+    /// The file has another form.
     #[error("{}: {problem}", path.display())]
     Syntax {
         /// Path of the file.
@@ -122,11 +123,15 @@ impl RunReport {
     /// # Errors
     /// [`ReportError`] names the file.
     pub fn read(folder: &Path) -> Result<Self, ReportError> {
-        let path = folder.join(FILE);
-        let text = bounded_file::read_text(&path, MAX_BYTES)
-            .map_err(|source| ReportError::Read { path: path.clone(), source })?;
-        serde_json::from_str(&text).map_err(|error| ReportError::Syntax { path, problem: error.to_string() })
+        read_json(folder.join(FILE))
     }
+}
+
+/// Reads a file of a run.
+fn read_json<T: DeserializeOwned>(path: PathBuf) -> Result<T, ReportError> {
+    let text =
+        bounded_file::read_text(&path, MAX_BYTES).map_err(|source| ReportError::Read { path: path.clone(), source })?;
+    serde_json::from_str(&text).map_err(|error| ReportError::Syntax { path, problem: error.to_string() })
 }
 
 #[cfg(test)]

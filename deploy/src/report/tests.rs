@@ -161,16 +161,16 @@ fn runs_are_compared_column_by_column() {
         let report = RunReport { run: name, ..report() };
         let metrics = Metrics { ticks: 4, answered, ..metrics("pastat") };
         std::fs::write(folder.join(FILE), serde_json::to_string(&report).unwrap()).unwrap();
-        std::fs::write(folder.join("metrics.json"), serde_json::to_string(&metrics).unwrap()).unwrap();
+        std::fs::write(folder.join(crate::score::metrics::FILE), serde_json::to_string(&metrics).unwrap()).unwrap();
     }
     let text = Comparison::read(&folders).unwrap().to_string();
     let lines: Vec<&str> = text.lines().collect();
     assert!(lines[0].starts_with("run") && lines[0].contains("one") && lines[0].ends_with("two"), "{text}");
     let latency = lines.iter().find(|line| line.starts_with("latency, median, ms")).unwrap();
     assert_eq!(latency.split_whitespace().rev().take(2).collect::<Vec<_>>(), ["100", "100"], "{text}");
-    assert!(text.contains("Runs answered different ticks"), "{text}");
+    assert!(text.contains("Runs answered different numbers of ticks"), "{text}");
 
-    std::fs::remove_file(folders[1].join("metrics.json")).unwrap();
+    std::fs::remove_file(folders[1].join(crate::score::metrics::FILE)).unwrap();
     let message = Comparison::read(&folders).unwrap_err().to_string();
     assert!(message.contains("two/metrics.json"), "{message}");
 }

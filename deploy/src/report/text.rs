@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-use support::text_table::{Side, TextTable};
+use support::text_table::{Side, TextTable, number};
 
 use super::{Pace, RunReport, Spread};
 use crate::operate::progress::bytes;
@@ -114,8 +114,4 @@ fn milliseconds(spread: &Spread) -> String {
 
 fn percent(share: f64) -> String {
     format!("{:.0} %", 100.0 * share)
-}
-
-fn number(value: Option<f64>, digits: usize) -> String {
-    value.map_or("-".into(), |value| format!("{value:.digits$}"))
 }

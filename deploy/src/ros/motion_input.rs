@@ -29,6 +29,8 @@ pub struct MotionReport {
     pub read: u64,
     /// Messages that could not be read, or in which nothing is measured.
     pub unreadable: u64,
+    /// Measurements that were discarded when a message with the same or an earlier stamp followed.
+    pub out_of_order: u64,
 }
 
 /// Measurements of one vehicle.
@@ -109,10 +111,10 @@ impl Measurements {
         };
         report.read += 1;
         if let Some(speed_mps) = motion.speed_mps {
-            self.speed_mps.add(capture_nanos, speed_mps);
+            report.out_of_order += self.speed_mps.add(capture_nanos, speed_mps);
         }
         if let Some(yaw_rate_rad_s) = motion.yaw_rate_rad_s.filter(|_| takes_yaw_rate) {
-            self.yaw_rate_rad_s.add(capture_nanos, yaw_rate_rad_s);
+            report.out_of_order += self.yaw_rate_rad_s.add(capture_nanos, yaw_rate_rad_s);
         }
     }
 

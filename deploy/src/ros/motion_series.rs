@@ -16,16 +16,19 @@ const MOST: usize = 4096;
 pub(super) struct MotionSeries(VecDeque<(u64, f64)>);
 
 impl MotionSeries {
-    /// Adds a measurement. Those of later times are dropped: a bag has begun again.
-    pub(super) fn add(&mut self, nanos: u64, value: f64) {
+    /// Adds a measurement. Those of the same or later times are discarded, since a bag has begun again; their number.
+    pub(super) fn add(&mut self, nanos: u64, value: f64) -> u64 {
+        let mut discarded = 0;
         while self.0.back().is_some_and(|(last, _)| *last >= nanos) {
             self.0.pop_back();
+            discarded += 1;
         }
         self.0.push_back((nanos, value));
         let is_old = |first: &(u64, f64)| nanos - first.0 > KEPT_NANOS;
         while self.0.len() > MOST || self.0.front().is_some_and(is_old) {
             self.0.pop_front();
         }
+        discarded
     }
 
     /// The value at a time: between two measurements the straight line, else the nearest one that is near enough.
@@ -72,7 +75,9 @@ mod tests {
 
     fn series(values: &[(u64, f64)]) -> MotionSeries {
         let mut series = MotionSeries::default();
-        values.iter().for_each(|(ms, value)| series.add(ms * MS, *value));
+        for (ms, value) in values {
+            assert_eq!(series.add(ms * MS, *value), 0);
+        }
         series
     }
 
@@ -101,11 +106,11 @@ mod tests {
     #[test]
     fn a_bag_that_begins_again_leaves_nothing_of_before() {
         let mut series = series(&[(1000, 1.0), (1020, 2.0)]);
-        series.add(500 * MS, 7.0);
+        assert_eq!(series.add(500 * MS, 7.0), 2);
         assert_eq!((series.at(1010 * MS), series.at(500 * MS)), (None, Some(7.0)));
-        (0..10_000).for_each(|k| series.add(3_000 * MS + k, 0.0));
+        (0..10_000).for_each(|k| assert_eq!(series.add(3_000 * MS + k, 0.0), 0));
         assert_eq!(series.0.len(), MOST);
-        series.add(9_000 * MS, 0.0);
+        assert_eq!(series.add(9_000 * MS, 0.0), 0);
         assert_eq!(series.0.len(), 1);
     }
 }

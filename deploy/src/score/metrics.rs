@@ -17,6 +17,9 @@ pub use contribution::Contribution;
 /// Pose error below which localization counts as a success, metres.
 const SUCCESS_M: f64 = 3.0;
 
+/// File name in the folder of a run.
+pub const FILE: &str = "metrics.json";
+
 /// Metrics of one run.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct Metrics {

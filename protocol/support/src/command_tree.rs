@@ -35,7 +35,7 @@ struct ArgumentTree {
     /// Smallest and largest number of values.
     num_args: Option<(usize, usize)>,
     value_names: Vec<String>,
-    /// What completes a value, by the name that [`ValueHint`] parses.
+    /// Source of completions of a value, by the name that [`ValueHint`] parses.
     hint: Option<String>,
     default_values: Vec<String>,
     hides_default: bool,
@@ -49,7 +49,7 @@ struct ArgumentTree {
     is_last: bool,
 }
 
-/// What an argument does with its values.
+/// Treatment of the values of an argument.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 enum Kind {
     #[default]

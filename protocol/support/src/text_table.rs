@@ -46,6 +46,12 @@ impl fmt::Display for TextTable {
     }
 }
 
+/// A number with this many decimals; a dash if it is unknown.
+#[must_use]
+pub fn number(value: Option<f64>, digits: usize) -> String {
+    value.map_or("-".into(), |value| format!("{value:.digits$}"))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

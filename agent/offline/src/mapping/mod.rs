@@ -95,7 +95,7 @@ pub enum MapError {
     Resume {
         /// The file.
         path: PathBuf,
-        /// What is wrong with it.
+        /// Description of the problem.
         reason: String,
     },
     /// A training failed, or data cannot be read.

@@ -10,7 +10,7 @@ use fusion::Method;
 use localization::pgc::wrong_place::wrong_place_hint;
 use localization::pose_source::PoseSourceConfig;
 use support::output;
-use support::text_table::{Side, TextTable};
+use support::text_table::{Side, TextTable, number};
 
 use crate::run::loss;
 use crate::run::run_fleet::RunResult;
@@ -196,10 +196,6 @@ fn lines(columns: &[Column], rows: usize) -> String {
     let mut table = TextTable::new(columns.iter().map(|column| (column.name.as_str(), column.side)));
     (0..rows).for_each(|row| table.row(columns.iter().map(|column| column.cells[row].clone())));
     table.to_string()
-}
-
-fn number(value: Option<f64>, digits: usize) -> String {
-    value.map_or("-".into(), |value| format!("{value:.digits$}"))
 }
 
 #[cfg(test)]

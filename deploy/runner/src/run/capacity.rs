@@ -1,5 +1,5 @@
-//! Capacity: estimate of the pace of a live run on this machine, from a few frames of its scene, and what would help
-//! where it does not keep up.
+//! Capacity: estimate of the pace of a live run on this machine, from a few frames of its scene, and remedies for a
+//! machine that does not keep up.
 
 use std::io;
 use std::path::Path;
@@ -21,8 +21,8 @@ use crate::run::stepped::{evaluate_config, recorded};
 
 /// Time for computing frames; loading the models comes on top.
 const BUDGET: Duration = Duration::from_millis(600);
-/// CPU time of replay, transport, encoding, router and scorer, as a share of that of the networks: a round number, of
-/// which a run's report shows the parts.
+/// CPU time of replay, transport, encoding, router and scorer, as a share of that of the networks: a round number; the
+/// report of a run shows the parts.
 const OVERHEAD: f64 = 0.2;
 
 /// [`estimate`] in a short-lived process of its own, so that models and their memory are not kept by the

@@ -51,7 +51,7 @@ fn try_draw(fleet: &Fleet, frame: &JudgedFrame, path: &Path) -> Result<(), Box<d
         boxes.map(move |shape| shape.center_m[axis]).chain(vehicles)
     };
     Picture {
-        title: format!("{}  tick {}, that with most neighbours  {}", fleet.scenario.method, frame.tick, scenario.name),
+        title: format!("{}  tick {} (most neighbours)  {}", fleet.scenario.method, frame.tick, scenario.name),
         x_m: around(places(0), rule.x_m),
         y_m: around(places(1), rule.y_m),
         views: loaded

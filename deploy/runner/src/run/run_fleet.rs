@@ -325,7 +325,7 @@ fn write(
     let missed = missed(fleet, &board, &watched.ending);
     let metrics = metrics(fleet, &board, &progress, &sum);
     let metrics = Metrics { ticks: metrics.answered + missed, ..metrics };
-    note(folder.write_json("metrics.json", &metrics));
+    note(folder.write_json(deploy::score::metrics::FILE, &metrics));
     let remedies = remedies(fleet, capacity.as_ref());
     let run_report = RunReport::new(run, &metrics, board.records(), &stats, capacity);
     note(folder.write_json(report::FILE, &run_report));

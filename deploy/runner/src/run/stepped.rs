@@ -170,7 +170,7 @@ fn write(
     let balance = ledger.balance();
     let names = [fleet.scenario.method.name(), fleet.pose_source()];
     let metrics = Metrics::of(board, "stepped", names, board.seconds(), ledger, Some(evaluator.sent_bytes()));
-    folder.write_json("metrics.json", &metrics)?;
+    folder.write_json(deploy::score::metrics::FILE, &metrics)?;
     let report = RunReport::new(run, &metrics, board.records(), &[], None);
     folder.write_json(report::FILE, &report)?;
     folder.write_frames(board.records(), &std::collections::BTreeMap::new())?;

@@ -11,7 +11,7 @@ use super::{
     write,
 };
 
-/// What the public reader and a decoder of ROS 2 messages find.
+/// Findings of the public reader and a decoder of ROS 2 messages.
 fn public_reader(path: &Path) -> serde_json::Value {
     let script = concat!(env!("CARGO_MANIFEST_DIR"), "/../../deploy/tools/check_recording.py");
     let python = std::env::var("V2V_PYTHON").unwrap_or_else(|_| "python3".into());
