@@ -45,6 +45,10 @@ pub(crate) struct FrameAssembler {
     /// Area in which each vehicle detects, from its descriptor.
     areas: BTreeMap<CavId, DetectionArea>,
     judge: Judge,
+    /// The ego whose results are shown; `None`: that of the next result.
+    ego: Option<CavId>,
+    /// All egos with results.
+    egos: BTreeSet<CavId>,
 }
 
 /// Messages of one scene frame.
@@ -75,7 +79,13 @@ impl FrameAssembler {
         Self { areas, ..Self::default() }
     }
 
-    /// Adds a message. A result completes its scene frame, which is returned; so is a scene frame without a result when
+    /// An assembler of the scene frames of another ego, which knows what this one knows of the run.
+    pub(crate) fn for_ego(&self, ego: Option<CavId>) -> Self {
+        let (areas, ledgers, egos) = (self.areas.clone(), self.ledgers.clone(), self.egos.clone());
+        Self { areas, ledgers, egos, ego, ..Self::default() }
+    }
+
+    /// Adds a message. A result of the ego completes its scene frame, which is returned; so is a scene frame without a result when
     /// too many wait. Invalid messages are ignored here and counted by their receivers.
     pub(crate) fn add(&mut self, seen: &ReceivedMessage<'_>) -> Option<SceneFrame> {
         if let Topic::Stats(_) = seen.topic {
@@ -127,12 +137,8 @@ impl FrameAssembler {
         let area = frame.result.as_ref().and_then(|(_, result)| self.areas.get(&result.ego)).copied();
         let judgement = frame.judged(area.as_ref(), &mut self.judge);
         let shown = frame.frame(capture_nanos, &self.ledgers, &judgement);
-        Some(SceneFrame { pace: self.pace.pace(), area, ap_50: self.judge.average_precision(), ..shown })
-    }
-
-    /// Forgets which scene frames were shown: a recording is shown in any order. Detection areas hold for all of it.
-    pub(crate) fn rewind(&mut self) {
-        *self = Self { areas: std::mem::take(&mut self.areas), ..Self::default() };
+        let (pace, ap_50) = (self.pace.pace(), self.judge.average_precision());
+        Some(SceneFrame { pace, area, ap_50, egos: self.egos.iter().cloned().collect(), ..shown })
     }
 
     fn keep_ledger(&mut self, seen: &ReceivedMessage<'_>) {
@@ -160,8 +166,8 @@ impl FrameAssembler {
                     self.frame(at).truth = Some((published, truth));
                 }
             }
-            Topic::Stream { stream: Stream::Detections, .. } => {
-                if let Some(result) = decode(seen) {
+            Topic::Stream { cav, stream: Stream::Detections } => {
+                if let Some(result) = decode(seen).filter(|_| self.shows_results_of(cav)) {
                     self.frame(at).result = Some((published, result));
                     return true;
                 }
@@ -187,10 +193,19 @@ impl FrameAssembler {
                 }
                 self.arrived(at, cav, *stream, 0, seen);
             }
-            Topic::Received { cav, stream, .. } => self.arrived(at, cav, *stream, 2, seen),
+            Topic::Received { ego, cav, stream } => {
+                if self.ego.as_ref().is_none_or(|shown| shown == ego) {
+                    self.arrived(at, cav, *stream, 2, seen);
+                }
+            }
             Topic::Control(_) | Topic::Ready(_) | Topic::Stats(_) | Topic::Alive { .. } => {}
         }
         false
+    }
+
+    fn shows_results_of(&mut self, ego: &CavId) -> bool {
+        self.egos.insert(ego.clone());
+        self.ego.get_or_insert_with(|| ego.clone()) == ego
     }
 
     fn arrived(&mut self, at: u64, cav: &CavId, stream: Stream, rank: u8, seen: &ReceivedMessage<'_>) {
@@ -250,6 +265,7 @@ impl OpenFrame {
             links: self.links(),
             stages: result.map_or(Vec::new(), |result| result.stages.clone()),
             pace: ShownPace::default(),
+            egos: Vec::new(),
             area: None,
             ap_50: None,
             processes: ledgers

@@ -1,5 +1,6 @@
 //! Live run: follows the newest scene frame.
 
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::{self, JoinHandle};
@@ -9,14 +10,14 @@ use bus::bounded_queue::Pop;
 use bus::{Bus, BusError, PassiveSubscriber, RawMessage};
 use bytes::Bytes;
 use futures_util::{Stream as Pieces, stream};
-use protocol::{KeyExpr, Kind, RunId, Stream, Topic, Verb, wire};
+use protocol::{Camera, CavId, ImageFormat, Key, KeyExpr, Kind, Limits, RunId, Stream, Topic, Verb, wire};
 use serde::Serialize;
 use tokio::sync::watch;
 use tokio::time::{sleep, timeout};
 use zenoh::Wait;
 
 use super::frame_assembler::{FrameAssembler, ReceivedMessage};
-use super::images::NewestImages;
+use super::on_demand::OnDemand;
 
 /// Largest number of waiting messages of one key.
 const PLACES: usize = 4;
@@ -26,19 +27,33 @@ const PREVIEW_PLACES: usize = 2;
 const SHORTEST_PERIOD: Duration = Duration::from_millis(95);
 /// Interval between empty messages to a page without a new frame, which also detect that it has closed.
 const HEARTBEAT: Duration = Duration::from_secs(1);
+/// Largest number of images that are kept: 16 vehicles of four cameras.
+const MOST_IMAGES: usize = 64;
+/// Largest number of feature maps that are kept.
+const MOST_MAPS: usize = 16;
+/// Largest number of egos of which pages are served at the same time.
+const MOST_EGOS: usize = 16;
 /// Empty message.
 const NOTHING_NEW: [u8; 4] = [0; 4];
 /// Interval at which the thread checks for open pages.
 const CHECK_PERIOD: Duration = Duration::from_millis(100);
 
+/// Newest image of each camera.
+type NewestImages = OnDemand<(CavId, u8), (ImageFormat, Bytes)>;
+/// Newest feature map of each vehicle, as a message.
+type NewestMaps = OnDemand<CavId, Bytes>;
+/// Newest scene frame, after its length, of each ego that a page shows; of no name: the first with results. Empty: none
+/// so far.
+type NewestFrames = Mutex<BTreeMap<Option<CavId>, Arc<watch::Sender<Bytes>>>>;
+
 /// Newest scene frame of a run, for any number of pages. The run is subscribed to only while a page is open, so that a
 /// closed page costs nothing. Points are those of previews, which are sent only while they have a subscriber.
 pub struct LiveRun {
-    /// Newest scene frame after its length; empty: none so far.
-    newest: Arc<watch::Sender<Bytes>>,
+    newest: Arc<NewestFrames>,
     run: RunId,
     activity: Arc<Mutex<RunActivity>>,
     images: Arc<NewestImages>,
+    maps: Arc<NewestMaps>,
     ending: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
 }
@@ -71,23 +86,26 @@ impl LiveRun {
     /// [`BusError`] when the system gives no thread.
     pub fn start(bus: Bus) -> Result<Self, BusError> {
         let run = bus.identity().run.clone();
-        let newest = Arc::new(watch::Sender::default());
+        let newest = Arc::<NewestFrames>::default();
         let ending = Arc::<AtomicBool>::default();
-        let (activity, images) = (Arc::default(), Arc::default());
+        let activity = Arc::default();
+        let (images, maps) = (Arc::new(OnDemand::new(MOST_IMAGES)), Arc::new(OnDemand::new(MOST_MAPS)));
         let listener = Listener {
             bus,
             run: run.clone(),
             newest: Arc::clone(&newest),
             ending: Arc::clone(&ending),
             assembly: FrameAssembler::default(),
+            others: BTreeMap::new(),
             activity: Arc::clone(&activity),
             images: Arc::clone(&images),
+            maps: Arc::clone(&maps),
         };
         let thread = thread::Builder::new()
             .name("view".into())
             .spawn(move || listener.run())
             .map_err(|cause| BusError::Thread { what: "the view".into(), cause })?;
-        Ok(Self { newest, run, activity, images, ending, thread: Some(thread) })
+        Ok(Self { newest, run, activity, images, maps, ending, thread: Some(thread) })
     }
 
     /// Name of the run.
@@ -98,7 +116,7 @@ impl LiveRun {
 
     /// State of the run.
     pub(super) fn status(&self) -> RunStatus {
-        let activity = self.activity.lock().unwrap_or_else(PoisonError::into_inner);
+        let activity = lock(&self.activity);
         RunStatus {
             silent_s: activity.last_message.map(|at| at.elapsed().as_secs_f64()),
             is_over: activity.is_over,
@@ -112,16 +130,21 @@ impl LiveRun {
         &self.images
     }
 
+    /// Newest feature maps of the vehicles.
+    pub(super) fn maps(&self) -> &NewestMaps {
+        &self.maps
+    }
+
     /// Number of open pages.
     #[cfg(test)]
     pub(crate) fn watchers(&self) -> usize {
-        self.newest.receiver_count()
+        lock(&self.newest).values().map(|newest| newest.receiver_count()).sum()
     }
 
-    /// Scene frames for one page, each after its length (32 bits, little-endian; 0: nothing new): the newest whenever
+    /// Scene frames of an ego (`None`: the first with results) for one page, each after its length (32 bits, little-endian; 0: nothing new): the newest whenever
     /// the page has taken the previous one, until `limit` of them or the end of the run.
-    pub fn moments(&self, limit: Option<u64>) -> impl Pieces<Item = Bytes> + Send + use<> {
-        let newest = self.newest.subscribe();
+    pub fn moments(&self, limit: Option<u64>, ego: Option<CavId>) -> impl Pieces<Item = Bytes> + Send + use<> {
+        let newest = self.subscribe(ego);
         stream::unfold((newest, limit, Duration::ZERO), |(mut newest, left, pause)| async move {
             if left == Some(0) {
                 return None;
@@ -139,6 +162,18 @@ impl LiveRun {
     }
 }
 
+impl LiveRun {
+    fn subscribe(&self, ego: Option<CavId>) -> watch::Receiver<Bytes> {
+        let mut newest = lock(&self.newest);
+        let ego = ego.filter(|_| newest.len() <= MOST_EGOS);
+        newest.entry(ego).or_default().subscribe()
+    }
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
 impl Drop for LiveRun {
     fn drop(&mut self) {
         self.ending.store(true, Ordering::Relaxed);
@@ -154,11 +189,15 @@ impl Drop for LiveRun {
 struct Listener {
     bus: Bus,
     run: RunId,
-    newest: Arc<watch::Sender<Bytes>>,
+    newest: Arc<NewestFrames>,
     ending: Arc<AtomicBool>,
+    /// Scene frames of the first ego with results.
     assembly: FrameAssembler,
+    /// Scene frames of the egos that pages name.
+    others: BTreeMap<CavId, FrameAssembler>,
     activity: Arc<Mutex<RunActivity>>,
     images: Arc<NewestImages>,
+    maps: Arc<NewestMaps>,
 }
 
 /// Subscriptions while a page is open.
@@ -182,10 +221,11 @@ impl Listener {
     fn run(mut self) {
         let mut ears: Option<Subscriptions> = None;
         let mut cameras: Option<PassiveSubscriber> = None;
+        let mut maps = None;
         while !self.ending.load(Ordering::Relaxed) {
             self.watch_router();
             if !self.is_watched() {
-                (ears, cameras) = (None, None);
+                (ears, cameras, maps) = (None, None, None);
                 thread::sleep(CHECK_PERIOD);
                 continue;
             }
@@ -200,6 +240,7 @@ impl Listener {
                 continue;
             };
             self.follow_cameras(&mut cameras);
+            self.follow_maps(&mut maps);
             // Previews first: a scene frame is shown when its result is taken, and its sweeps have arrived long before.
             if let Pop::Item(_, message) = rest.take(Some(Instant::now() + CHECK_PERIOD)) {
                 while let Pop::Item(_, preview) = previews.take(Some(Instant::now())) {
@@ -216,16 +257,12 @@ impl Listener {
 
     fn watch_router(&self) {
         let has_router = self.bus.session().info().routers_zid().wait().next().is_some();
-        self.activity().has_router = has_router;
-    }
-
-    fn activity(&self) -> MutexGuard<'_, RunActivity> {
-        self.activity.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.activity).has_router = has_router;
     }
 
     /// Receives images only while a page shows them: they are the largest stream after sweeps.
     fn follow_cameras(&self, cameras: &mut Option<PassiveSubscriber>) {
-        if !self.images.are_wanted() {
+        if self.images.wanted().is_empty() {
             *cameras = None;
             return;
         }
@@ -237,12 +274,43 @@ impl Listener {
         }
         let Some(cameras) = cameras else { return };
         while let Pop::Item(_, message) = cameras.take(Some(Instant::now())) {
-            self.images.keep(&message.key.topic, &message.bytes());
+            let Topic::Stream { cav, stream: Stream::Camera(number) } = &message.key.topic else { continue };
+            let Ok((_, Camera { metadata, image })) =
+                wire::decode::<Camera>([message.bytes().as_ref()], &Limits::DEFAULT)
+            else {
+                continue;
+            };
+            self.images.keep((cav.clone(), *number), (metadata.format, image.into()));
+        }
+    }
+
+    /// Receives the feature maps of the vehicles of which a page shows one.
+    fn follow_maps(&self, maps: &mut Option<(BTreeSet<CavId>, PassiveSubscriber)>) {
+        let wanted = self.maps.wanted();
+        if maps.as_ref().is_some_and(|(subscribed, _)| *subscribed != wanted) {
+            *maps = None;
+        }
+        if wanted.is_empty() {
+            return;
+        }
+        if maps.is_none() {
+            let selectors: Vec<KeyExpr> =
+                wanted.iter().map(|cav| KeyExpr::one(&Key::stream(&self.run, cav, Stream::Bev))).collect();
+            match self.bus.tap(&selectors, PREVIEW_PLACES) {
+                Ok(opened) => *maps = Some((wanted, opened)),
+                Err(error) => tracing::error!("no feature maps are shown: {error}"),
+            }
+        }
+        let Some((_, maps)) = maps else { return };
+        while let Pop::Item(_, message) = maps.take(Some(Instant::now())) {
+            if let Topic::Stream { cav, stream: Stream::Bev } = &message.key.topic {
+                self.maps.keep(cav.clone(), Bytes::copy_from_slice(&message.bytes()));
+            }
         }
     }
 
     fn is_watched(&self) -> bool {
-        self.newest.receiver_count() > 0
+        lock(&self.newest).values().any(|newest| newest.receiver_count() > 0)
     }
 
     /// Reports of processes are no activity: a viewer reports too, for as long as its page is open.
@@ -250,7 +318,7 @@ impl Listener {
         if let Topic::Stats(_) = topic {
             return;
         }
-        let mut activity = self.activity();
+        let mut activity = lock(&self.activity);
         activity.last_message = Some(Instant::now());
         match topic {
             Topic::Control(Verb::End) => activity.is_over = true,
@@ -269,10 +337,19 @@ impl Listener {
         }
         let (arrived_nanos, payload) = (message.arrived_nanos, Some(bytes.as_ref()));
         let seen = ReceivedMessage { topic, header: &header, arrived_nanos, payload };
-        if let Some(frame) = self.assembly.add(&seen).filter(|_| self.is_watched()) {
-            let frame = frame.to_bytes();
-            let len = (frame.len() as u32).to_le_bytes();
-            self.newest.send_replace([len.as_slice(), &frame].concat().into());
+        let mut newest = lock(&self.newest);
+        newest.retain(|ego, frames| ego.is_none() || frames.receiver_count() > 0);
+        self.others.retain(|ego, _| newest.contains_key(&Some(ego.clone())));
+        for (ego, frames) in newest.iter() {
+            let assembly = match ego {
+                None => &mut self.assembly,
+                Some(cav) => self.others.entry(cav.clone()).or_insert_with(|| self.assembly.for_ego(ego.clone())),
+            };
+            if let Some(frame) = assembly.add(&seen).filter(|_| frames.receiver_count() > 0) {
+                let frame = frame.to_bytes();
+                let len = (frame.len() as u32).to_le_bytes();
+                frames.send_replace([len.as_slice(), &frame].concat().into());
+            }
         }
     }
 }

@@ -5,9 +5,11 @@
 //! same `FrameAssembler`, which returns [`SceneFrame`]s.
 
 mod frame_assembler;
-mod images;
+mod heat_map;
 mod judgement;
+mod link_series;
 mod live;
+mod on_demand;
 mod pace_counter;
 mod recorded;
 mod scene_frame;

@@ -2,15 +2,18 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
-use std::sync::{Mutex, PoisonError};
 
 use bytes::Bytes;
-use protocol::{Camera, CavId, Descriptor, Detections, ImageFormat, Limits, PoseEstimate, Stream, Topic, Truth, wire};
+use protocol::{
+    Camera, CavId, Descriptor, Detections, ImageFormat, Limits, Payload, PoseEstimate, Stream, Topic, Truth, wire,
+};
 use recording::{Entry, Recording, RecordingError};
 use serde::Serialize;
 
 use super::frame_assembler::{FrameAssembler, ReceivedMessage};
+use super::heat_map::HeatMap;
 use super::judgement::{DetectionArea, Judge};
+use super::link_series::{LinkSeries, LinkTraffic};
 use super::pace_counter::PaceCounter;
 use super::scene_frame::SceneFrame;
 use crate::operate::run_folder::{RECORDING, SWEEP_LOG};
@@ -37,21 +40,29 @@ pub struct RecordedRun {
     recording: Recording,
     name: String,
     moments: Vec<Moment>,
+    /// One for each ego, in the order of their first results; one for a run without results.
+    timelines: Vec<Timeline>,
     /// Arrival time of each sweep at the ego's agent, if the run recorded it.
     swept: BTreeMap<u64, u64>,
     /// Entries with the reports of all processes.
     stats: Vec<usize>,
-    pace: PaceCounter,
-    assembly: Mutex<FrameAssembler>,
+    areas: BTreeMap<CavId, DetectionArea>,
 }
 
-/// One scene frame: its messages in the recording, and its entry in the timeline.
+/// One scene frame: its messages in the recording.
 struct Moment {
     capture_nanos: u64,
     /// Time of publication of its truth.
     began_nanos: Option<u64>,
     entries: Vec<usize>,
-    summary: MomentSummary,
+}
+
+/// The results of one ego.
+struct Timeline {
+    ego: Option<CavId>,
+    /// One for each moment.
+    summaries: Vec<MomentSummary>,
+    pace: PaceCounter,
 }
 
 /// Entry of a scene frame in the timeline.
@@ -71,6 +82,8 @@ pub(crate) struct MomentSummary {
     pub fused: usize,
     /// Distance of the ego's pose from the truth, metres.
     pub ego_error_m: Option<f64>,
+    /// Traffic of the links to the ego.
+    pub links: Vec<LinkTraffic>,
 }
 
 impl RecordedRun {
@@ -107,20 +120,15 @@ impl RecordedRun {
             }
         }
         let swept = support::sweep_log::read(&file.with_file_name(SWEEP_LOG)).unwrap_or_default();
-        let (pace, mut judge) = (PaceCounter::default(), Judge::default());
-        let assembly = Mutex::new(FrameAssembler::with_areas(areas.clone()));
-        let mut run = Self { recording, name, moments: Vec::new(), swept, stats, pace, assembly };
-        for (capture_nanos, entries) in moments {
-            if let Some(summary) = run.summary(capture_nanos, &entries, &areas, &mut judge)? {
-                let truth = entries.iter().map(|index| run.entry(*index)).find(|entry| entry.key.topic == Topic::Truth);
-                let began_nanos = truth.map(|entry| entry.header.stamp.publish_nanos);
-                if let Some(began) = began_nanos {
-                    run.pace.tick(summary.latency_ms.map(|latency_ms| began.saturating_add((latency_ms * 1e6) as u64)));
-                }
-                run.moments.push(Moment { capture_nanos, began_nanos, entries, summary });
-            }
+        let mut run = Self { recording, name, moments: Vec::new(), timelines: Vec::new(), swept, stats, areas };
+        run.moments = moments.into_iter().filter_map(|(at, entries)| run.moment(at, entries)).collect();
+        if run.moments.is_empty() {
+            return Err(ViewError::Empty(file));
         }
-        if run.moments.is_empty() { Err(ViewError::Empty(file)) } else { Ok(run) }
+        let egos = run.egos();
+        let shown = if egos.is_empty() { vec![None] } else { egos.into_iter().map(Some).collect() };
+        run.timelines = shown.into_iter().map(|ego| run.timeline_of(ego)).collect::<Result<_, _>>()?;
+        Ok(run)
     }
 
     /// Name of the run.
@@ -141,34 +149,33 @@ impl RecordedRun {
         self.moments.is_empty()
     }
 
-    /// Entries of the timeline.
-    pub(crate) fn timeline(&self) -> impl Iterator<Item = &MomentSummary> {
-        self.moments.iter().map(|moment| &moment.summary)
+    /// Entries of the timeline of an ego, or of the first ego.
+    pub(crate) fn timeline(&self, ego: Option<&CavId>) -> &[MomentSummary] {
+        self.shown(ego).map_or(&[], |timeline| &timeline.summaries)
     }
 
-    /// A scene frame, counted from 0; `None` after the last.
+    /// A scene frame, counted from 0, with the results of an ego, or of the first ego; `None` after the last.
     ///
     /// # Errors
     /// [`RecordingError`] when the file has changed.
-    pub fn frame(&self, index: usize) -> Result<Option<SceneFrame>, RecordingError> {
-        let Some(moment) = self.moments.get(index) else { return Ok(None) };
-        let mut assembly = self.assembly.lock().unwrap_or_else(PoisonError::into_inner);
-        assembly.rewind();
+    pub fn frame(&self, index: usize, ego: Option<&CavId>) -> Result<Option<SceneFrame>, RecordingError> {
+        let (Some(moment), Some(timeline)) = (self.moments.get(index), self.shown(ego)) else { return Ok(None) };
+        let mut assembly = FrameAssembler::with_areas(self.areas.clone()).for_ego(timeline.ego.clone());
         let until = moment.entries.iter().map(|entry| self.entry(*entry).arrived_nanos).max().unwrap_or(0);
         // Results come last, and complete the scene frame.
         let (results, others): (Vec<usize>, Vec<usize>) =
             moment.entries.iter().partition(|entry| is_result(&self.entry(**entry).key.topic));
-        for index in self.reports_until(until).into_iter().chain(others).chain(results) {
-            let entry = self.entry(index);
+        for number in self.reports_until(until).into_iter().chain(others).chain(results) {
+            let entry = self.entry(number);
             let payload = if is_wanted(&entry.key.topic) { Some(self.recording.read(entry)?) } else { None };
             let Entry { key, header, arrived_nanos, .. } = entry;
             let (topic, payload) = (&key.topic, payload.as_deref());
             let shown = assembly.add(&ReceivedMessage { topic, header, arrived_nanos: *arrived_nanos, payload });
             if shown.is_some() {
-                return Ok(shown.map(|frame| self.with_sweep(frame, moment)));
+                return Ok(shown.map(|frame| self.complete(frame, index, timeline)));
             }
         }
-        Ok(assembly.show(moment.capture_nanos).map(|frame| self.with_sweep(frame, moment)))
+        Ok(assembly.show(moment.capture_nanos).map(|frame| self.complete(frame, index, timeline)))
     }
 
     /// The image of a camera at a scene frame; `None` if there is none.
@@ -181,14 +188,24 @@ impl RecordedRun {
         cav: &CavId,
         number: u8,
     ) -> Result<Option<(ImageFormat, Bytes)>, RecordingError> {
-        let topic = Topic::Stream { cav: cav.clone(), stream: Stream::Camera(number) };
-        let entries = self.moments.get(index).into_iter().flat_map(|moment| &moment.entries);
-        let Some(entry) = entries.map(|entry| self.entry(*entry)).find(|entry| entry.key.topic == topic) else {
-            return Ok(None);
-        };
-        let bytes = self.recording.read(entry)?;
+        let Some(bytes) = self.message(index, cav, Stream::Camera(number))? else { return Ok(None) };
         let decoded = wire::decode::<Camera>([bytes.as_slice()], &Limits::DEFAULT).ok();
         Ok(decoded.map(|(_, Camera { metadata, image })| (metadata.format, image.into())))
+    }
+
+    /// The heat map of a vehicle's feature map at a scene frame; `None` if it published none.
+    ///
+    /// # Errors
+    /// [`RecordingError`] when the file has changed.
+    pub(super) fn heat_map(&self, index: usize, cav: &CavId) -> Result<Option<HeatMap>, RecordingError> {
+        Ok(self.message(index, cav, Stream::Bev)?.and_then(|bytes| HeatMap::of(&bytes)))
+    }
+
+    fn message(&self, index: usize, cav: &CavId, stream: Stream) -> Result<Option<Vec<u8>>, RecordingError> {
+        let topic = Topic::Stream { cav: cav.clone(), stream };
+        let entries = self.moments.get(index).into_iter().flat_map(|moment| &moment.entries);
+        let entry = entries.map(|entry| self.entry(*entry)).find(|entry| entry.key.topic == topic);
+        entry.map(|entry| self.recording.read(entry)).transpose()
     }
 
     /// Numbers of the cameras of any vehicle.
@@ -200,10 +217,57 @@ impl RecordedRun {
         numbers.collect()
     }
 
-    fn with_sweep(&self, frame: SceneFrame, moment: &Moment) -> SceneFrame {
-        let swept = self.swept.get(&moment.capture_nanos).zip(moment.began_nanos);
-        let swept_ms = swept.map(|(swept, began)| (*swept as f64 - began as f64) / 1e6);
-        SceneFrame { swept_ms, pace: self.pace.pace(), ap_50: moment.summary.ap_50, ..frame }
+    fn shown(&self, ego: Option<&CavId>) -> Option<&Timeline> {
+        let asked = self.timelines.iter().find(|timeline| ego.is_some() && timeline.ego.as_ref() == ego);
+        asked.or(self.timelines.first())
+    }
+
+    /// All egos, in the order of their first results.
+    pub(super) fn egos(&self) -> Vec<CavId> {
+        let mut egos = Vec::new();
+        for entry in self.moments.iter().flat_map(|moment| &moment.entries).map(|entry| self.entry(*entry)) {
+            match &entry.key.topic {
+                Topic::Stream { cav, stream: Stream::Detections } if !egos.contains(cav) => egos.push(cav.clone()),
+                _ => {}
+            }
+        }
+        egos
+    }
+
+    /// `None` if there is neither truth nor result.
+    fn moment(&self, capture_nanos: u64, entries: Vec<usize>) -> Option<Moment> {
+        let topics = || entries.iter().map(|index| &self.entry(*index).key.topic);
+        if !topics().any(|topic| *topic == Topic::Truth || is_result(topic)) {
+            return None;
+        }
+        let truth = entries.iter().map(|index| self.entry(*index)).find(|entry| entry.key.topic == Topic::Truth);
+        let began_nanos = truth.map(|entry| entry.header.stamp.publish_nanos);
+        Some(Moment { capture_nanos, began_nanos, entries })
+    }
+
+    fn timeline_of(&self, ego: Option<CavId>) -> Result<Timeline, RecordingError> {
+        let links = ego.as_ref().map(|ego| LinkSeries::new(self.recording.entries(), ego)).unwrap_or_default();
+        let (mut pace, mut judge) = (PaceCounter::default(), Judge::default());
+        let mut summaries = Vec::with_capacity(self.moments.len());
+        for moment in &self.moments {
+            let mut summary = self.summary(moment, ego.as_ref(), &mut judge)?;
+            summary.links = links.at(moment.capture_nanos, moment.began_nanos);
+            if let Some(began) = moment.began_nanos {
+                pace.tick(summary.latency_ms.map(|latency_ms| began.saturating_add((latency_ms * 1e6) as u64)));
+            }
+            summaries.push(summary);
+        }
+        Ok(Timeline { ego, summaries, pace })
+    }
+
+    /// Adds what is known of a whole recording.
+    fn complete(&self, frame: SceneFrame, index: usize, timeline: &Timeline) -> SceneFrame {
+        let moment = self.moments.get(index);
+        let swept = moment.and_then(|moment| self.swept.get(&moment.capture_nanos).copied().zip(moment.began_nanos));
+        let swept_ms = swept.map(|(swept, began)| (swept as f64 - began as f64) / 1e6);
+        let ap_50 = timeline.summaries.get(index).and_then(|summary| summary.ap_50);
+        let egos = self.timelines.iter().filter_map(|timeline| timeline.ego.clone()).collect();
+        SceneFrame { swept_ms, pace: timeline.pace.pace(), ap_50, egos, ..frame }
     }
 
     fn entry(&self, index: usize) -> &Entry {
@@ -219,29 +283,23 @@ impl RecordedRun {
         last.into_values().collect()
     }
 
-    /// `None` if there is neither truth nor result.
     fn summary(
         &self,
-        capture_nanos: u64,
-        entries: &[usize],
-        areas: &BTreeMap<CavId, DetectionArea>,
+        moment: &Moment,
+        ego: Option<&CavId>,
         judge: &mut Judge,
-    ) -> Result<Option<MomentSummary>, RecordingError> {
-        let mut summary = MomentSummary { capture_s: capture_nanos as f64 / 1e9, ..MomentSummary::default() };
+    ) -> Result<MomentSummary, RecordingError> {
+        let capture_s = moment.capture_nanos as f64 / 1e9;
+        let mut summary = MomentSummary { capture_s, ..MomentSummary::default() };
         let (mut truth, mut result) = (None, None);
-        for entry in entries.iter().map(|index| self.entry(*index)) {
-            let is_truth = entry.key.topic == Topic::Truth;
-            if !is_truth && !is_result(&entry.key.topic) {
-                continue;
-            }
-            let bytes = self.recording.read(entry)?;
+        for entry in moment.entries.iter().map(|index| self.entry(*index)) {
             let published = entry.header.stamp.publish_nanos;
-            if is_truth {
-                truth = wire::decode::<Truth>([bytes.as_slice()], &Limits::DEFAULT).ok().map(|(_, it)| (published, it));
-            } else {
-                result = wire::decode::<Detections>([bytes.as_slice()], &Limits::DEFAULT)
-                    .ok()
-                    .map(|(_, it)| (published, it));
+            match &entry.key.topic {
+                Topic::Truth => truth = self.decoded::<Truth>(entry)?.map(|truth| (published, truth)),
+                Topic::Stream { cav, stream: Stream::Detections } if Some(cav) == ego => {
+                    result = self.decoded::<Detections>(entry)?.map(|result| (published, result));
+                }
+                _ => {}
             }
         }
         if let Some((done, result)) = &result {
@@ -250,12 +308,18 @@ impl RecordedRun {
             if let Some((began, truth)) = &truth {
                 summary.latency_ms = Some((*done as f64 - *began as f64) / 1e6);
                 summary.ego_error_m = ego_error_m(&result.pose, truth, result);
-                let area = areas.get(&result.ego);
+                let area = self.areas.get(&result.ego);
                 summary.judged = area.map(|area| judge.judge(result, truth, area).counts(result, SHOWN_SCORE));
             }
         }
         summary.ap_50 = judge.average_precision();
-        Ok((truth.is_some() || result.is_some()).then_some(summary))
+        Ok(summary)
+    }
+
+    /// The content of a message; `None` if it is damaged.
+    fn decoded<M: Payload>(&self, entry: &Entry) -> Result<Option<M>, RecordingError> {
+        let bytes = self.recording.read(entry)?;
+        Ok(wire::decode([bytes.as_slice()], &Limits::DEFAULT).ok().map(|(_, message)| message))
     }
 }
 

@@ -24,8 +24,10 @@ pub struct SceneFrame {
     pub capture_s: f64,
     /// Tick of the scene, from the truth.
     pub tick: Option<u64>,
-    /// The fusing vehicle.
+    /// The fusing vehicle; `None` at a tick without a result of the ego that is shown.
     pub ego: Option<CavId>,
+    /// All vehicles that fuse.
+    pub egos: Vec<CavId>,
     /// Fusion method.
     pub method: Option<String>,
     /// From the publication of the tick to that of its detections, milliseconds.

@@ -8,16 +8,20 @@ use bus::web::{Answer, Request, WebServer};
 use bytes::Bytes;
 use futures_util::StreamExt;
 use protocol::{CavId, ImageFormat};
+use recording::RecordingError;
 use serde_json::json;
 
+use super::heat_map::HeatMap;
 use super::{LiveRun, RecordedRun};
 
 const HTML: &str = include_str!("page/index.html");
 const STYLE: &str = include_str!("page/style.css");
 /// Scripts, in the order in which the page loads them.
-const SCRIPTS: [(&str, &str); 4] = [
+const SCRIPTS: [(&str, &str); 6] = [
     ("/view.js", include_str!("page/view.js")),
     ("/panels.js", include_str!("page/panels.js")),
+    ("/series.js", include_str!("page/series.js")),
+    ("/heat.js", include_str!("page/heat.js")),
     ("/scene.js", include_str!("page/scene.js")),
     ("/moments.js", include_str!("page/moments.js")),
 ];
@@ -37,12 +41,14 @@ pub fn serve_live(address: SocketAddr, run: Arc<LiveRun>) -> io::Result<WebServe
     WebServer::start(address, move |request| match request.path.as_str() {
         "/run" => document(&json!({"mode": "live", "run": run.name()})),
         "/live" => {
-            Answer::Stream { content_type: BINARY, pieces: run.moments(number_of("frames", &request.query)).boxed() }
+            let frames = run.moments(number_of("frames", &request.query), ego_of(&request.query));
+            Answer::Stream { content_type: BINARY, pieces: frames.boxed() }
         }
         "/status" => document(&json!(run.status())),
-        path => match camera(path) {
-            Some((cav, number)) => image(run.images().get(&cav, number)),
-            None => asset(request),
+        path => match (camera(path), mapped(path)) {
+            (Some(camera), _) => image(run.images().get(&camera)),
+            (None, Some(cav)) => heat_map(run.maps().get(&cav).and_then(|message| HeatMap::of(&message))),
+            (None, None) => asset(request),
         },
     })
 }
@@ -53,24 +59,25 @@ pub fn serve_live(address: SocketAddr, run: Arc<LiveRun>) -> io::Result<WebServe
 /// [`io::Error`] when the address cannot be listened at.
 pub fn serve_recorded(address: SocketAddr, run: Arc<RecordedRun>) -> io::Result<WebServer> {
     WebServer::start(address, move |request| {
+        let ego = ego_of(&request.query);
         if request.path == "/run" {
-            let timeline: Vec<_> = run.timeline().collect();
+            let timeline = run.timeline(ego.as_ref());
             return document(
                 &json!({"mode": "recorded", "run": run.name(), "timeline": timeline, "cameras": run.cameras()}),
             );
         }
+        let index = number_of("at", &request.query).and_then(|index| usize::try_from(index).ok()).unwrap_or(0);
         if let Some((cav, number)) = camera(&request.path) {
-            let index = number_of("at", &request.query).and_then(|index| usize::try_from(index).ok());
-            return match run.image(index.unwrap_or(0), &cav, number) {
-                Ok(found) => image(found),
-                Err(error) => Answer::NotFound(error.to_string()),
-            };
+            return run.image(index, &cav, number).map_or_else(not_found, image);
+        }
+        if let Some(cav) = mapped(&request.path) {
+            return run.heat_map(index, &cav).map_or_else(not_found, heat_map);
         }
         let Some(index) = request.path.strip_prefix("/frame/") else { return asset(request) };
-        match index.parse().map(|index| run.frame(index)) {
+        match index.parse().map(|index| run.frame(index, ego.as_ref())) {
             Ok(Ok(Some(frame))) => Answer::Page { content_type: BINARY, body: frame.to_bytes().into() },
             Ok(Ok(None)) => Answer::NotFound(format!("there are {} moments, counted from 0", run.len())),
-            Ok(Err(error)) => Answer::NotFound(error.to_string()),
+            Ok(Err(error)) => not_found(error),
             Err(error) => Answer::NotFound(format!("{index:?} is no number: {error}")),
         }
     })
@@ -80,6 +87,22 @@ pub fn serve_recorded(address: SocketAddr, run: Arc<RecordedRun>) -> io::Result<
 fn camera(path: &str) -> Option<(CavId, u8)> {
     let (cav, number) = path.strip_prefix("/camera/")?.split_once('/')?;
     Some((CavId::new(cav).ok()?, number.parse().ok()?))
+}
+
+/// Vehicle of `/map/<cav>`.
+fn mapped(path: &str) -> Option<CavId> {
+    CavId::new(path.strip_prefix("/map/")?).ok()
+}
+
+/// A heat map; nothing where there is none.
+fn heat_map(found: Option<HeatMap>) -> Answer {
+    let body = found.map_or(Bytes::new(), |map| map.to_bytes().into());
+    Answer::Page { content_type: BINARY, body }
+}
+
+#[expect(clippy::needless_pass_by_value, reason = "the error of a result")]
+fn not_found(error: RecordingError) -> Answer {
+    Answer::NotFound(error.to_string())
 }
 
 fn image(found: Option<(ImageFormat, Bytes)>) -> Answer {
@@ -107,5 +130,14 @@ fn document(value: &serde_json::Value) -> Answer {
 
 /// Number that a query has for `name`.
 fn number_of(name: &str, query: &str) -> Option<u64> {
-    query.split('&').find_map(|pair| pair.strip_prefix(name)?.strip_prefix('='))?.parse().ok()
+    text_of(name, query)?.parse().ok()
+}
+
+/// Ego whose results are asked for.
+fn ego_of(query: &str) -> Option<CavId> {
+    CavId::new(text_of("ego", query)?).ok()
+}
+
+fn text_of<'a>(name: &str, query: &'a str) -> Option<&'a str> {
+    query.split('&').find_map(|pair| pair.strip_prefix(name)?.strip_prefix('='))
 }

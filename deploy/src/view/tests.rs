@@ -11,8 +11,8 @@ use bus::web::fetch;
 use bus::{Bus, BusOptions, Endpoint, Identity, PublisherOptions};
 use protocol::message::{AgentTruth, FusedNeighbour, NeighbourState, StageTiming};
 use protocol::{
-    Box3d, CavId, Detection, Detections, Key, Lidar, PointCloud, Pose, PoseEstimate, RunId, Stamp, Stream, Topic,
-    TrueObject, Truth, wire,
+    Bev, BevFeatures, BevGrid, Box3d, CavId, CodecConfig, Detection, Detections, Key, Lidar, PointCloud, Pose,
+    PoseEstimate, RunId, Stamp, Stream, Topic, TrueObject, Truth, encode_features, wire,
 };
 use recording::{RecordingOptions, RecordingWriter};
 use serde_json::Value;
@@ -57,16 +57,16 @@ fn truth(tick: u64) -> Truth {
     Truth { tick, agents: [EGO, OTHER].map(agent).into() }
 }
 
-fn detections(tick: u64) -> Detections {
+fn detections_of(ego: &str, tick: u64) -> Detections {
     let box3d = Box3d { center_m: [10.0, 0.0, -1.0], size_m: [4.0, 1.8, 1.6], heading_rad: 0.0 };
     Detections {
-        ego: cav(EGO),
+        ego: cav(ego),
         agent_frame: tick,
         method: "max".into(),
-        pose: PoseEstimate::new(pose_of(EGO, tick), 0.9),
+        pose: PoseEstimate::new(pose_of(ego, tick), 0.9),
         detections: vec![Detection { box3d, score: 0.8, source: None }],
         fused: vec![FusedNeighbour {
-            cav: cav(OTHER),
+            cav: cav(other_than(ego)),
             age_nanos: 0,
             confidence: 0.7,
             payload_bytes: 1_000,
@@ -74,7 +74,7 @@ fn detections(tick: u64) -> Detections {
         }],
         skipped: Vec::new(),
         neighbours: vec![NeighbourState {
-            cav: cav(OTHER),
+            cav: cav(other_than(ego)),
             trust: Some(0.75),
             misbehaviour: None,
             clock_offset_s: Some(-0.25),
@@ -84,6 +84,36 @@ fn detections(tick: u64) -> Detections {
             StageTiming::new("fuse", Duration::from_millis(8)),
         ],
     }
+}
+
+fn other_than(ego: &str) -> &'static str {
+    if ego == EGO { OTHER } else { EGO }
+}
+
+/// A feature map of 4 by 2 cells.
+fn feature_map(who: &str, tick: u64) -> Bev {
+    let grid = BevGrid { x_min_m: -2.0, y_min_m: -1.0, cell_m: 1.0, width: 4, height: 2 };
+    let features = BevFeatures { grid, channels: 1, code_of: None, values: (0..8).map(|cell| cell as f32).collect() };
+    let features = encode_features(features, &CodecConfig::default(), None).unwrap();
+    Bev { pose: PoseEstimate::new(pose_of(who, tick), 0.9), features }
+}
+
+/// A feature map of the other vehicle, which reaches the ego over a link, and later a result of the other vehicle.
+fn messages_of_a_second_ego(tick: u64, now: u64) -> Vec<(Topic, Vec<u8>)> {
+    let stamp = |late_ms: u64| Stamp {
+        cav: cav(OTHER),
+        epoch: 1,
+        sequence: tick,
+        capture_nanos: 100_000_000 * (tick + 1),
+        publish_nanos: now + 1_000_000 * late_ms,
+    };
+    let map = wire::encode(&stamp(25), feature_map(OTHER, tick)).unwrap().to_vec();
+    let result = wire::encode(&stamp(30), detections_of(OTHER, tick)).unwrap().to_vec();
+    vec![
+        (Topic::Stream { cav: cav(OTHER), stream: Stream::Bev }, map.clone()),
+        (Topic::Received { ego: cav(EGO), cav: cav(OTHER), stream: Stream::Bev }, map),
+        (Topic::Stream { cav: cav(OTHER), stream: Stream::Detections }, result),
+    ]
 }
 
 /// The messages of a tick, published at `now`; the result half a tick later. Live, there are previews only.
@@ -104,16 +134,23 @@ fn messages(tick: u64, now: u64, sweeps: Stream) -> Vec<(Topic, Vec<u8>)> {
         let estimate = PoseEstimate::new(pose_of(who, tick), 0.9);
         all.push((stream(who, Stream::Pose), wire::encode(&stamp(who, 20), estimate).unwrap().to_vec()));
     }
-    all.push((stream(EGO, Stream::Detections), wire::encode(&stamp(EGO, 50), detections(tick)).unwrap().to_vec()));
+    all.push((
+        stream(EGO, Stream::Detections),
+        wire::encode(&stamp(EGO, 50), detections_of(EGO, tick)).unwrap().to_vec(),
+    ));
     all
 }
 
-fn record(folder: &Path) -> RecordedRun {
+fn record(folder: &Path, has_second_ego: bool) -> RecordedRun {
     let file = folder.join(crate::operate::run_folder::RECORDING);
     let mut writer = RecordingWriter::create(&file, RecordingOptions::default()).unwrap();
     let run = RunId::new("test").unwrap();
     for tick in 0..TICKS {
-        for (topic, payload) in messages(tick, 1_000_000_000 * tick, Stream::Lidar) {
+        let mut all = messages(tick, 1_000_000_000 * tick, Stream::Lidar);
+        if has_second_ego {
+            all.extend(messages_of_a_second_ego(tick, 1_000_000_000 * tick));
+        }
+        for (topic, payload) in all {
             let key: Key = topic.in_run(&run);
             writer.write(&key, 1_000_000_000 * tick + 60_000_000, &payload).unwrap();
         }
@@ -153,17 +190,17 @@ fn check(frame: &Value, points: usize) {
 #[test]
 fn a_recorded_run_is_shown_in_any_order() {
     let folder = tempfile::tempdir().unwrap();
-    let run = record(folder.path());
+    let run = record(folder.path(), false);
     assert_eq!((run.len(), run.name()), (TICKS as usize, "test"));
     for index in [3, 0, 4, 3] {
-        let (frame, points) = parsed(&run.frame(index).unwrap().unwrap().to_bytes());
+        let (frame, points) = parsed(&run.frame(index, None).unwrap().unwrap().to_bytes());
         assert_eq!(frame["tick"], index);
         check(&frame, points);
         assert!(points > 10_000, "two sweeps");
         assert_eq!(frame["pace"], serde_json::json!({"ticks": 5, "answered": 5, "rate_hz": 1.0}));
         assert_eq!((&frame["swept_ms"], &frame["posed_ms"]), (&3.0.into(), &20.0.into()));
     }
-    assert!(run.frame(5).unwrap().is_none());
+    assert!(run.frame(5, None).unwrap().is_none());
     let server = serve_recorded("127.0.0.1:0".parse().unwrap(), Arc::new(run)).unwrap();
     let about: Value = serde_json::from_slice(&fetch(server.address(), "/run").unwrap().1).unwrap();
     assert_eq!((&about["mode"], about["timeline"].as_array().unwrap().len()), (&"recorded".into(), 5));
@@ -175,6 +212,33 @@ fn a_recorded_run_is_shown_in_any_order() {
         assert!(fetch(server.address(), path).unwrap().0.contains("404"), "{path}");
     }
     assert!(matches!(RecordedRun::open(&folder.path().join("none")), Err(ViewError::NotRecorded(_))));
+}
+
+#[test]
+fn every_ego_of_a_recorded_run_is_shown_with_its_own_results() {
+    let folder = tempfile::tempdir().unwrap();
+    let run = record(folder.path(), true);
+    assert_eq!(run.egos(), [cav(EGO), cav(OTHER)], "in the order of their results");
+    let latency_ms = |ego: Option<&str>| run.timeline(ego.map(cav).as_ref())[1].latency_ms.unwrap();
+    assert_eq!([None, Some(EGO), Some(OTHER), Some("77")].map(latency_ms), [50.0, 50.0, 30.0, 50.0]);
+    for (ego, name) in [(None, EGO), (Some(cav(OTHER)), OTHER)] {
+        let (frame, _) = parsed(&run.frame(2, ego.as_ref()).unwrap().unwrap().to_bytes());
+        assert_eq!((&frame["ego"], &frame["egos"]), (&name.into(), &serde_json::json!([EGO, OTHER])));
+        assert_eq!(frame["links"][0]["from"], other_than(name));
+    }
+    // Published 25 ms after the tick and recorded at 60 ms, long before the next tick.
+    let links = &run.timeline(None)[2].links;
+    assert_eq!((links.len(), links[0].from.as_str(), links[0].waiting_bytes), (1, OTHER, Some(0)));
+    assert!(links[0].sent_bytes > 100 && links[0].transit_ms == Some(35.0), "{links:?}");
+
+    let server = serve_recorded("127.0.0.1:0".parse().unwrap(), Arc::new(run)).unwrap();
+    let body = |path: &str| fetch(server.address(), path).unwrap().1;
+    assert_eq!(parsed(&body(&format!("/frame/0?ego={OTHER}"))).0["ego"], OTHER);
+    let about: Value = serde_json::from_slice(&body(&format!("/run?ego={OTHER}"))).unwrap();
+    assert_eq!(about["timeline"][0]["latency_ms"], 30.0);
+    let map = body(&format!("/map/{OTHER}?at=1"));
+    assert_eq!(&map[map.len() - 8..], [0, 36, 72, 109, 145, 182, 218, 255]);
+    assert!(body(&format!("/map/{EGO}?at=1")).is_empty(), "it has published none");
 }
 
 #[test]
@@ -220,13 +284,13 @@ struct Traffic {
 }
 
 impl Traffic {
-    fn start() -> Self {
+    fn start(has_second_ego: bool) -> Self {
         let endpoint = Endpoint::loopback(TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port());
         let ending = Arc::<AtomicBool>::default();
         let bus = join(&BusOptions::router(endpoint.clone()), "replay");
         std::thread::spawn({
             let ending = Arc::clone(&ending);
-            move || publish(bus, &ending)
+            move || publish(bus, &ending, has_second_ego)
         });
         Self { endpoint, ending }
     }
@@ -244,10 +308,12 @@ fn join(options: &BusOptions, name: &str) -> Bus {
     Bus::join(options, identity).unwrap()
 }
 
-fn publish(bus: Bus, ending: &AtomicBool) {
+fn publish(bus: Bus, ending: &AtomicBool, has_second_ego: bool) {
     let mut publishers = std::collections::BTreeMap::new();
     for tick in 0.. {
-        for (topic, payload) in messages(tick, bus::unix_nanos(), Stream::Preview) {
+        let now = bus::unix_nanos();
+        let second = if has_second_ego { messages_of_a_second_ego(tick, now) } else { Vec::new() };
+        for (topic, payload) in messages(tick, now, Stream::Preview).into_iter().chain(second) {
             if matches!(topic, Topic::Stream { stream: Stream::Detections, .. }) {
                 // As long as perception takes: sweeps are far ahead of their results.
                 std::thread::sleep(Duration::from_millis(50));
@@ -267,12 +333,12 @@ fn publish(bus: Bus, ending: &AtomicBool) {
 
 #[test]
 fn a_live_run_is_shown_and_a_slow_page_delays_no_other() {
-    let traffic = Traffic::start();
+    let traffic = Traffic::start(false);
     let run = Arc::new(LiveRun::start(join(&BusOptions::client(traffic.endpoint.clone()), "viewer")).unwrap());
     let server = serve_live("127.0.0.1:0".parse().unwrap(), Arc::clone(&run)).unwrap();
 
     // The run is subscribed to only once a page is open.
-    let moments: Vec<_> = moments_of(server.address(), 20).iter().map(|bytes| parsed(bytes)).collect();
+    let moments: Vec<_> = moments_of(server.address(), "frames=20").iter().map(|bytes| parsed(bytes)).collect();
     let captures: Vec<f64> = moments.iter().map(|(frame, _)| frame["capture_s"].as_f64().unwrap()).collect();
     assert!(captures.windows(2).all(|pair| pair[0] < pair[1]), "always a newer one: {captures:?}");
     // On a busy machine the passive subscriber drops parts of some frames, but hardly ever of all.
@@ -287,7 +353,7 @@ fn a_live_run_is_shown_and_a_slow_page_delays_no_other() {
     asleep.write_all(b"GET /live HTTP/1.1\r\n\r\n").unwrap();
     wait_for("it is counted as a watcher", || run.watchers() == 1);
     // Others are served meanwhile.
-    assert_eq!(moments_of(server.address(), 3).len(), 3);
+    assert_eq!(moments_of(server.address(), "frames=3").len(), 3);
     wait_for("it is dropped", || server.readers().dropped() == 1);
     wait_for("and no watcher any more", || run.watchers() == 0);
 
@@ -299,11 +365,30 @@ fn a_live_run_is_shown_and_a_slow_page_delays_no_other() {
     wait_for("the run is silent", || run.status().silent_s.is_some_and(|silent_s| silent_s > 1.5));
 }
 
-/// `count` moments of a live run.
-fn moments_of(address: SocketAddr, count: u64) -> Vec<Vec<u8>> {
+#[test]
+fn another_ego_and_a_feature_map_of_a_live_run_are_shown_on_request() {
+    let traffic = Traffic::start(true);
+    let run = Arc::new(LiveRun::start(join(&BusOptions::client(traffic.endpoint.clone()), "viewer")).unwrap());
+    let server = serve_live("127.0.0.1:0".parse().unwrap(), Arc::clone(&run)).unwrap();
+    let mut default_view = TcpStream::connect(server.address()).unwrap();
+    default_view.write_all(b"GET /live HTTP/1.1\r\n\r\n").unwrap();
+    wait_for("the default view is watched", || run.watchers() == 1);
+    for ego in [EGO, OTHER] {
+        let moments = moments_of(server.address(), &format!("frames=10&ego={ego}"));
+        let shown: Vec<Value> = moments.iter().map(|bytes| parsed(bytes).0["ego"].clone()).collect();
+        assert!(shown.iter().all(|shown| shown.is_null() || *shown == ego), "{shown:?}");
+        assert!(shown.iter().any(|shown| *shown == ego), "{shown:?}");
+    }
+    // Received once a page asks for it.
+    let path = format!("/map/{OTHER}");
+    wait_for("a feature map", || !fetch(server.address(), &path).unwrap().1.is_empty());
+}
+
+/// Moments of a live run, as many as the query says.
+fn moments_of(address: SocketAddr, query: &str) -> Vec<Vec<u8>> {
     let mut connection = TcpStream::connect(address).unwrap();
     connection.set_read_timeout(Some(TIMEOUT)).unwrap();
-    write!(connection, "GET /live?frames={count} HTTP/1.0\r\n\r\n").unwrap();
+    write!(connection, "GET /live?{query} HTTP/1.0\r\n\r\n").unwrap();
     let mut answer = Vec::new();
     connection.read_to_end(&mut answer).unwrap();
     let mut rest = &answer[answer.windows(4).position(|bytes| bytes == b"\r\n\r\n").unwrap() + 4..];

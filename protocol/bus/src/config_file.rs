@@ -4,7 +4,7 @@ use std::fmt::{self, Display};
 use std::path::{Path, PathBuf};
 
 use protocol::config::FieldError;
-use serde::de::DeserializeOwned;
+use serde::de::{DeserializeOwned, IgnoredAny};
 
 /// Maximum size of a file, bytes.
 const MAX_BYTES: u64 = 1 << 20;
@@ -66,11 +66,38 @@ pub fn read<T: DeserializeOwned>(path: &Path) -> Result<T, ConfigError> {
 /// # Errors
 /// [`ConfigError::Syntax`].
 pub fn parse<T: DeserializeOwned>(text: &str, path: &Path) -> Result<T, ConfigError> {
-    serde_saphyr::from_str(text).map_err(|error| ConfigError::Syntax {
-        path: path.into(),
-        line: error.location().map(|location| location.line()),
-        reason: error.without_snippet().to_string().lines().next().unwrap_or_default().trim().to_owned(),
+    serde_saphyr::from_str(text).map_err(|error| {
+        // A file that is no YAML may begin like one with an unknown field.
+        let (error, field) = match serde_saphyr::from_str::<IgnoredAny>(text) {
+            Err(no_yaml) => (no_yaml, None),
+            Ok(_) => (error, field_of_error::<T>(text)),
+        };
+        let reason = reason(&error);
+        ConfigError::Syntax {
+            path: path.into(),
+            line: error.location().map(|location| location.line()),
+            reason: field.map_or(reason.clone(), |field| format!("{field}: {reason}")),
+        }
     })
+}
+
+/// Text of an error in one line, without its position.
+fn reason(error: &serde_saphyr::Error) -> String {
+    let text = error.without_snippet().to_string();
+    let line = text.lines().next().unwrap_or_default().trim();
+    line.rsplit_once(" at line ").map_or(line, |(reason, _)| reason).to_owned()
+}
+
+/// Field at which a text stops being a `T`, for example `scene.rate`; `None` for the whole document.
+fn field_of_error<T: DeserializeOwned>(text: &str) -> Option<String> {
+    let mut field = None;
+    let parsed: Result<T, _> = serde_saphyr::with_deserializer_from_str(text, |deserializer| {
+        serde_path_to_error::deserialize(deserializer).map_err(|error| {
+            field = Some(error.path().to_string());
+            error.into_inner()
+        })
+    });
+    field.filter(|field| parsed.is_err() && field != ".")
 }
 
 #[cfg(test)]
@@ -82,6 +109,32 @@ mod tests {
     struct Small {
         #[expect(dead_code, reason = "only its name matters")]
         rate: f64,
+    }
+
+    #[derive(Debug, serde::Deserialize)]
+    struct Nested {
+        #[expect(dead_code, reason = "only its fields matter")]
+        scene: Small,
+    }
+
+    fn error_of(text: &str) -> String {
+        parse::<Nested>(text, Path::new("a.yaml")).unwrap_err().to_string()
+    }
+
+    #[test]
+    fn a_wrong_field_is_named_with_its_place_once() {
+        let message = error_of("scene:\n  rate: fast\n");
+        assert!(message.starts_with("a.yaml:2: scene.rate: ") && !message.contains("at line"), "{message}");
+        let message = error_of("scene: {rat: 1}\n");
+        assert!(message.starts_with("a.yaml:1: scene.rat: unknown field `rat`, expected"), "{message}");
+        assert_eq!(error_of("{}"), "a.yaml:1: missing field `scene`");
+    }
+
+    #[test]
+    fn a_file_that_is_no_yaml_says_so_before_its_fields() {
+        let message = error_of("scene: {rat: 1}\nthis is: [not yaml\n");
+        assert!(!message.contains("rat") && !message.contains("this is"), "{message}");
+        assert!(message.contains("flow sequence"), "{message}");
     }
 
     #[test]

@@ -98,7 +98,14 @@ impl BusError {
     /// True if the input is at fault, so that a retry has no effect.
     #[must_use]
     pub fn is_bad_input(&self) -> bool {
-        matches!(self, Self::Endpoint(_) | Self::Keys { .. } | Self::NoKeys(_) | Self::SharedMemory { .. })
+        matches!(
+            self,
+            Self::Endpoint(_)
+                | Self::PortInUse { .. }
+                | Self::Keys { .. }
+                | Self::NoKeys(_)
+                | Self::SharedMemory { .. }
+        )
     }
 
     /// An error of zenoh during an operation.

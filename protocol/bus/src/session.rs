@@ -252,8 +252,13 @@ pub fn open(options: &BusOptions) -> Result<Session, BusError> {
     }
     let config = config(options)?;
     let began = Instant::now();
+    // Before zenoh tries, which would print a warning of its own first; it fails too if another process is faster.
+    if let Role::Router { listen } = &options.role
+        && port_in_use(listen)
+    {
+        return Err(BusError::PortInUse { endpoint: listen.clone() });
+    }
     zenoh::open(config).wait().map_err(|cause| match &options.role {
-        // Checked only after zenoh has failed, so the result cannot race with a successful start.
         Role::Router { listen } if port_in_use(listen) => BusError::PortInUse { endpoint: listen.clone() },
         Role::Router { listen } => BusError::zenoh(format!("listening at {listen}"), &cause),
         Role::Client { connect } => {

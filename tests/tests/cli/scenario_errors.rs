@@ -92,8 +92,9 @@ fn a_port_in_use_is_named() {
     let folder = tempfile::tempdir().unwrap();
     let scenario = write_scenario(folder.path(), 1, "", &format!("network: {{listen: \"{endpoint}\"}}"));
     let (code, stderr) = refused(folder.path(), &scenario);
-    assert_eq!(code, Some(1), "{stderr}");
+    assert_eq!(code, Some(2), "{stderr}");
     assert!(stderr.contains(&endpoint) && stderr.contains("in use"), "{stderr}");
+    assert!(!stderr.contains("WARN"), "{stderr}");
     assert!(!folder.path().join("runs/test").exists(), "the name is free for the next attempt");
 }
 

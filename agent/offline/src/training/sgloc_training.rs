@@ -87,7 +87,7 @@ pub fn train_sgloc(
         |trainer: &Trainer| trainer.share_done((trainer.steps() * run.batch as u64) as f64 / list.len() as f64);
     while share_done(&trainer) < 1.0 {
         let rows = draw.rows(trainer.steps(), run.batch * CELLS)?;
-        let loss = coordinate_loss(&network, &cache, &rows)?;
+        let loss = coordinate_loss(&network, &cache, &rows, run.precision.kind())?;
         window.push(loss.f_double_value(&[])?);
         trainer.step(&loss, share_done(&trainer))?;
         trainer.check_interruption(&variables)?;
@@ -128,10 +128,10 @@ impl Draw {
 }
 
 /// Mean L1 error of the scene coordinates of some cells, metres, the sum of its axes as in SGLoc.
-fn coordinate_loss(network: &SgLoc, cache: &FeatureCache, rows: &Tensor) -> Result<Tensor, TchError> {
-    let cells = cache.cells.f_index_select(0, rows)?.f_to_kind(Kind::Float)?;
+fn coordinate_loss(network: &SgLoc, cache: &FeatureCache, rows: &Tensor, kind: Kind) -> Result<Tensor, TchError> {
+    let cells = cache.cells.f_index_select(0, rows)?;
     let sensor_m = cache.sensor_m.f_index_select(0, rows)?;
-    let found_m = network.coordinates(&cells, &sensor_m, true)?;
+    let found_m = network.coordinates(&cells, &sensor_m, kind, true)?;
     let error_m = (found_m - cache.targets_m.f_index_select(0, rows)?).f_abs()?;
     error_m.f_sum_dim_intlist(1_i64, false, Kind::Float)?.f_mean(Kind::Float)
 }

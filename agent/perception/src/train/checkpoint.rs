@@ -18,6 +18,8 @@ use tch::{Kind, TchError, Tensor, no_grad};
 
 use super::adamw::AdamW;
 
+/// Name of the checkpoint in the folder of the results.
+pub(super) const CHECKPOINT_FILE: &str = "checkpoint.safetensors";
 /// Metadata key of the progress of the training.
 const PROGRESS_KEY: &str = "progress";
 

@@ -7,9 +7,10 @@ use std::time::Duration;
 use support::output;
 use tch::Device;
 
+use super::checkpoint::CHECKPOINT_FILE;
 use super::interruption::Interruption;
 use super::run_config::{ComputePrecision, Length, RunConfig};
-use super::trainer::{CHECKPOINT_FILE, Trained};
+use super::trainer::Trained;
 use crate::compute_device::{ComputeDevice, NoCuda};
 
 /// Options that are invalid for any training.

@@ -6,6 +6,7 @@ use std::time::Duration;
 use tch::{Device, Kind};
 
 use super::adamw::AdamWConfig;
+use super::checkpoint::CHECKPOINT_FILE;
 use super::error::TrainingError;
 use super::interruption::Interruption;
 
@@ -58,13 +59,22 @@ impl RunConfig {
         }
     }
 
-    /// Creates the folder of the results and seeds the tensor library; must precede the first draw of a parameter.
+    /// Creates the folder of the results, without the checkpoint of an earlier training that is not resumed, and seeds the tensor library; must precede the first draw of a parameter.
     ///
     /// # Errors
-    /// [`TrainingError::Io`] when the folder cannot be created.
+    /// [`TrainingError::Io`] when the folder cannot be created, or the checkpoint not removed.
     pub fn start(&self) -> Result<(), TrainingError> {
         tch::manual_seed(self.seed as i64);
-        std::fs::create_dir_all(&self.out).map_err(|source| TrainingError::Io { path: self.out.clone(), source })
+        std::fs::create_dir_all(&self.out).map_err(|source| TrainingError::Io { path: self.out.clone(), source })?;
+        if self.resume {
+            return Ok(());
+        }
+        // Of a training that is overwritten: --resume would go on with it if this one ended before its first checkpoint.
+        let path = self.out.join(CHECKPOINT_FILE);
+        match std::fs::remove_file(&path) {
+            Err(source) if source.kind() != std::io::ErrorKind::NotFound => Err(TrainingError::Io { path, source }),
+            _ => Ok(()),
+        }
     }
 }
 
@@ -109,5 +119,22 @@ impl Length {
             Self::Epochs(epochs) => epoch / epochs.max(f64::MIN_POSITIVE),
             Self::Time(limit) => seconds / limit.as_secs_f64().max(f64::MIN_POSITIVE),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_training_that_starts_anew_leaves_no_older_checkpoint_to_resume() {
+        let folder = tempfile::tempdir().unwrap();
+        let checkpoint = folder.path().join(CHECKPOINT_FILE);
+        let run = RunConfig { resume: true, ..RunConfig::new(Length::Steps(1), folder.path()) };
+        std::fs::write(&checkpoint, b"").unwrap();
+        run.start().unwrap();
+        assert!(checkpoint.exists());
+        RunConfig { resume: false, ..run }.start().unwrap();
+        assert!(!checkpoint.exists());
     }
 }

@@ -11,7 +11,7 @@ use tch::Tensor;
 use tch::nn::VarStore;
 
 use super::adamw::{AdamW, Step};
-use super::checkpoint;
+use super::checkpoint::{self, CHECKPOINT_FILE};
 use super::curve::Curve;
 use super::data_listing::DataListing;
 use super::error::TrainingError;
@@ -20,8 +20,6 @@ use super::run_config::RunConfig;
 use super::schedule::OneCycle;
 use crate::weights;
 
-/// Name of the checkpoint in the folder of the results.
-pub(super) const CHECKPOINT_FILE: &str = "checkpoint.safetensors";
 /// Number of gradients in a row that are not finite after which a training fails.
 const MAX_SKIPPED: u32 = 20;
 

@@ -22,6 +22,9 @@ pub(crate) struct Arguments {
     /// Only print the number of runs and the time that they will take.
     #[arg(long)]
     dry_run: bool,
+    /// Keep the feature maps of all sweeps after the last run: a grid that is extended later needs no encoding again.
+    #[arg(long)]
+    keep_maps: bool,
     /// Compute the runs whose numbers come on standard input, for another sweep.
     #[arg(long, hide = true)]
     worker: bool,
@@ -40,23 +43,24 @@ impl Arguments {
             sweep.work()?;
             return Ok(Outcome::Done);
         }
-        let options = SweepOptions { out: out.clone(), jobs: usize::from(self.jobs), dry_run: self.dry_run };
+        let jobs = usize::from(self.jobs);
+        let options = SweepOptions { out: out.clone(), jobs, dry_run: self.dry_run, keep_maps: self.keep_maps };
         let swept = sweep.run(&options)?;
         output::text(&swept.table)?;
         if !self.dry_run {
             note_maps(&out.join("maps"));
-            output::note(format_args!("report {}", out.join("report.html").display()));
+            output::note(format_args!("all columns and the report: {}", out.display()));
         }
         Ok(left_out(swept.left_out.iter()))
     }
 }
 
-/// Names the size of the feature maps, which are most of what a sweep leaves.
+/// Names the size of the feature maps that are kept.
 fn note_maps(folder: &Path) {
     let files = fs::read_dir(folder).into_iter().flatten().flatten();
     let bytes: u64 = files.filter_map(|file| Some(file.metadata().ok()?.len())).sum();
     if bytes > 0 {
         let megabytes = bytes as f64 / 1e6;
-        output::note(format_args!("{megabytes:.1} MB of feature maps in {}, for the next runs", folder.display()));
+        output::note(format_args!("{megabytes:.1} MB of feature maps in {}", folder.display()));
     }
 }

@@ -11,9 +11,14 @@ function hint(text) {
   $("hint").hidden = false;
 }
 
+/// Address of data of the chosen ego.
+const ofEgo = (path) => (view.ego ? `${path}?ego=${view.ego}` : path);
+
 /// Live: frames as they arrive, each after its length; the server keeps only the newest for each page.
+let stream = new AbortController();
 async function live() {
-  const answer = await fetch("live");
+  stream = new AbortController();
+  const answer = await fetch(ofEgo("live"), { signal: stream.signal });
   const reader = answer.body.getReader();
   let rest = new Uint8Array(0);
   state("live", "live");
@@ -41,6 +46,8 @@ async function watch() {
   setInterval(check, 1000);
   for (;;) {
     await live().catch(() => {});
+    // Another ego was chosen.
+    if (stream.signal.aborted) continue;
     state("ended", "v2vloc view is gone; trying again");
     await new Promise((resolve) => setTimeout(resolve, 2000));
   }
@@ -64,7 +71,7 @@ async function check() {
 const tape = { timeline: [], at: -1, wanted: 0, busy: false, playing: null };
 
 async function moment(index) {
-  const answer = await fetch(`frame/${index}`);
+  const answer = await fetch(ofEgo(`frame/${index}`));
   if (!answer.ok) throw new Error(await answer.text());
   return parse(await answer.arrayBuffer());
 }
@@ -82,7 +89,7 @@ async function resultUntil(index) {
 
 /// A link to the moment in the address; not during play, as browsers limit how often that may change.
 function link() {
-  if (!tape.playing && tape.at >= 0) history.replaceState(null, "", `#at=${tape.at}`);
+  if (!tape.playing && tape.at >= 0) history.replaceState(null, "", `#at=${tape.at}${view.ego ? `&ego=${view.ego}` : ""}`);
 }
 
 /// Recorded: one frame at a time; during a fetch only the last request counts.
@@ -158,8 +165,27 @@ function asked(address) {
   return at ? Number(at[1]) : 0;
 }
 
+/// Ego that an address names (`&ego=CAV`).
+function askedEgo(address) {
+  const ego = /[#?&]ego=([a-z0-9_-]+)/.exec(address);
+  return ego ? ego[1] : null;
+}
+
+/// Shows the results of another ego.
+async function chooseEgo(ego) {
+  view.ego = ego;
+  view.answered = null;
+  kept = [];
+  if (!tape.timeline.length) return stream.abort();
+  tape.timeline = (await (await fetch(ofEgo("run"))).json()).timeline;
+  tape.at = -1;
+  await seek(tape.wanted);
+}
+$("ego").addEventListener("change", () => chooseEgo($("ego").value));
+
 async function begin() {
-  const run = await (await fetch("run")).json();
+  view.ego = askedEgo(location.href);
+  const run = await (await fetch(ofEgo("run"))).json();
   $("run").textContent = run.run;
   document.title = `${run.run} · v2vloc`;
   view.cameras = run.cameras || [];
@@ -181,12 +207,16 @@ async function begin() {
     if (event.key === "ArrowRight") { event.preventDefault(); play(false); seek(tape.wanted + 1); }
     if (event.key === "ArrowLeft") { event.preventDefault(); play(false); seek(tape.wanted - 1); }
   });
-  addEventListener("hashchange", (event) => seek(asked(event.newURL)));
+  addEventListener("hashchange", async (event) => {
+    const ego = askedEgo(event.newURL);
+    if (ego !== view.ego) await chooseEgo(ego);
+    await seek(asked(event.newURL));
+  });
   state("recorded", "recorded");
   await seek(asked(location.href));
 }
 
-addEventListener("resize", () => { draw(); spark(); });
-matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { draw(); spark(); });
+addEventListener("resize", () => { draw(); series(); spark(); });
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { draw(); series(); spark(); });
 
 begin().catch((error) => { fail(String(error)); state("ended", "no answer from v2vloc view"); });

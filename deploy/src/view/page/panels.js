@@ -27,6 +27,7 @@ function facts(frame) {
 function panels(frame) {
   const last = view.answered || frame;
   $("vehicles").replaceChildren(...frame.vehicles.map((vehicle) => vehicleCard(vehicle, last.ego)));
+  egos(frame.egos);
   legend(frame);
   cameras(frame);
   card();
@@ -42,6 +43,19 @@ function panels(frame) {
   messages(frame.messages);
   processes(frame.processes);
 }
+
+/// Choice of the ego, where there are several.
+function egos(all) {
+  $("egobox").hidden = all.length < 2;
+  const shown = view.ego || (view.answered && view.answered.ego);
+  if ($("ego").children.length !== all.length) {
+    $("ego").replaceChildren(...all.map((cav) => element("option", { value: cav }, cav)));
+  }
+  if (shown && document.activeElement !== $("ego")) $("ego").value = shown;
+}
+
+/// The selected vehicle, or the ego.
+const focused = (frame) => (view.chosen && view.chosen.cav) || (view.answered && view.answered.ego) || (frame.vehicles[0] && frame.vehicles[0].cav);
 
 /// Standard deviation of a position along its longest axis, metres: of the covariance, or as Eq. 6 maps the confidence.
 function sigma(vehicle) {
@@ -116,7 +130,7 @@ function cameras(frame) {
     const numbers = frame.messages.flatMap(({ topic }) => /\/camera\/(\d+)$/.exec(topic)?.[1] ?? []);
     view.cameras = [...new Set(numbers)].sort();
   }
-  const chosen = (view.chosen && view.chosen.cav) || (view.answered && view.answered.ego) || (frame.vehicles[0] && frame.vehicles[0].cav);
+  const chosen = focused(frame);
   $("cameras").hidden = !view.cameras.length || !chosen;
   if ($("cameras").hidden) return;
   $("cameracav").textContent = chosen;
@@ -220,6 +234,7 @@ function legend(frame) {
     ["truth", "object, found or not expected", "var(--truth)", "thin"], ["missed", "object, missed", "var(--truth)", "dashed"],
     ["single", "detections of single vehicles", "var(--faint)", "dotted"], ["area", "detection area of the ego", "var(--area)", "thin"],
     ["sigma", "95 % of the position (σ)", "var(--faint)", "round"],
+    ["map", `feature map of ${focused(frame) || "a vehicle"}${heat.isMissing ? ": none" : ""}`, swatch(focused(frame) || ""), "shade"],
   ].concat(known.map((cav) => [`points ${cav}`, `vehicle ${cav}, its points`, swatch(cav), "dots"]));
   const key = JSON.stringify(entries);
   if (key === shown) return;
@@ -229,7 +244,7 @@ function legend(frame) {
     box.checked = !view.hidden.has(layer);
     box.addEventListener("change", () => {
       if (box.checked) view.hidden.delete(layer); else view.hidden.add(layer);
-      draw();
+      refresh();
     });
     return element("label", { swatch: shade }, box, element("i", { class: kind }), name);
   }));

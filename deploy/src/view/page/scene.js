@@ -25,6 +25,7 @@ function draw() {
   };
   rings(pen, middle, width, height);
   if (!frame) return;
+  drawHeat(pen, frame, place, scale);
   let offset = 0;
   for (const vehicle of frame.vehicles) {
     if (vehicle.world_from_lidar && !view.hidden.has(`points ${vehicle.cav}`)) points(pen, vehicle, offset, place, width, height);

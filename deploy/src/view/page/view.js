@@ -1,5 +1,6 @@
 "use strict";
-// Page of `v2vloc view`: shared state and the newest frame. panels.js fills the panels, scene.js draws, moments.js fetches.
+// Page of `v2vloc view`: shared state and the newest frame. panels.js fills the panels, scene.js draws the scene and heat.js
+// a feature map in it, series.js draws the links over time, moments.js fetches.
 
 const $ = (id) => document.getElementById(id);
 const root = document.documentElement;
@@ -43,11 +44,13 @@ function element(tag, attributes = {}, ...children) {
 // ---- state of the page ----
 
 const view = {
-  frame: null, points: null, zoom: 7, shift: [0, 0], turn: 0, follow: true, centre: [0, 0], hidden: new Set(), score: 0.2,
+  frame: null, points: null, zoom: 7, shift: [0, 0], turn: 0, follow: true, centre: [0, 0], hidden: new Set(["map"]), score: 0.2,
   /// The last frame with detections: shown, faded, at ticks without.
   answered: null,
   /// What was clicked: { cav } or { object } or { detection: [x, y] }.
   chosen: null,
+  /// The ego that was asked for; `null`: the first with results.
+  ego: null,
   cameras: [],
   /// Cameras of a live run beyond the images that the server keeps.
   imagesLeftOut: 0,
@@ -79,6 +82,7 @@ function show({ frame, points }) {
     view.turn = at.yaw_rad;
   }
   frame.vehicles.forEach((vehicle) => swatch(vehicle.cav));
+  keepLinks(frame);
   root.dataset.frames = String(Number(root.dataset.frames) + 1);
   $("hint").hidden = true;
   refresh();
@@ -107,5 +111,6 @@ function refresh() {
   if (!view.frame) return;
   facts(view.frame);
   panels(view.frame);
-  requestAnimationFrame(draw);
+  fetchHeat(view.frame);
+  requestAnimationFrame(() => { draw(); series(); });
 }

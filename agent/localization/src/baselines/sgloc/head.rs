@@ -67,19 +67,20 @@ impl SgLocHead {
     }
 
     /// `[N, 3]` world coordinates relative to the origin of the network, metres, of normalised features
-    /// `[N, cell_channels]` of cells at `sensor_m` `[N, 3]`, metres in the sensor frame.
+    /// `[N, cell_channels]` of cells at `sensor_m` `[N, 3]`, metres in the sensor frame. Computed in the precision of
+    /// the features; the last layer in single precision, as its output is added to metres.
     ///
     /// # Errors
     /// Those of the tensor library.
     pub(super) fn forward(&self, cells: &Tensor, sensor_m: &Tensor, train: bool) -> Result<Tensor, TchError> {
         let mut parts = self.weigh(cells)?;
-        parts.push(sensor_m / POSITION_SCALE_M);
+        parts.push((sensor_m / POSITION_SCALE_M).f_to_kind(cells.kind())?);
         let mut x = self.inward.forward(&Tensor::f_cat(&parts, 1)?, train)?.f_relu()?;
         for [first, second] in &self.blocks {
             let inner = first.forward(&x, train)?.f_relu()?;
             x = (x + second.forward(&inner, train)?).f_relu()?;
         }
-        Ok(sensor_m + self.outward.forward(&x)?.f_to_kind(Kind::Float)? * SHIFT_SCALE_M)
+        Ok(sensor_m + self.outward.forward(&x.f_to_kind(Kind::Float)?)? * SHIFT_SCALE_M)
     }
 
     /// The features scale by scale, each weighted by what it and the fine scale say (tri-scale spatial attention).

@@ -1,7 +1,7 @@
 //! Network: the encoder of the cells of a sweep, and the head that regresses their scene coordinates.
 
 use tch::nn;
-use tch::{TchError, Tensor};
+use tch::{Kind, TchError, Tensor};
 
 use super::SgLocConfig;
 use super::head::SgLocHead;
@@ -44,12 +44,12 @@ impl SgLoc {
     }
 
     /// `[N, 3]` world coordinates relative to the origin, metres, of some cells' features `[N, cell_channels]`, which
-    /// lie at `sensor_m` `[N, 3]` in the sensor frame; `train` as in batch normalisation.
+    /// lie at `sensor_m` `[N, 3]` in the sensor frame; computed in `kind`, with `train` as in batch normalisation.
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub fn coordinates(&self, cells: &Tensor, sensor_m: &Tensor, train: bool) -> Result<Tensor, TchError> {
-        self.head.forward(&self.norm.forward(cells)?, sensor_m, train)
+    pub fn coordinates(&self, cells: &Tensor, sensor_m: &Tensor, kind: Kind, train: bool) -> Result<Tensor, TchError> {
+        self.head.forward(&self.norm.forward(cells)?.f_to_kind(kind)?, sensor_m, train)
     }
 
     /// Sets the normalisation from features `[N, cell_channels]`; without it they enter unchanged.

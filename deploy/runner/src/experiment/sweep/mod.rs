@@ -36,6 +36,7 @@ pub use grid::{Point, points};
 pub use spec::{CodecSpec, Experiment, Generate, Grid, NoiseSpec};
 pub use table::csv;
 
+use self::varying::VaryingTable;
 use crate::experiment::evaluation::{EvaluationError, evaluate};
 use crate::scenario::weights_choice::{WeightsChoiceError, weights_of};
 
@@ -45,7 +46,7 @@ const PROBED_TICKS: usize = 4;
 /// Result of a sweep.
 #[derive(Debug, Default)]
 pub struct Swept {
-    /// The table, as CSV.
+    /// What varies in the table, for a terminal.
     pub table: String,
     /// Data that each run left out.
     pub left_out: Vec<LeftOut>,
@@ -113,6 +114,8 @@ pub struct SweepOptions {
     pub jobs: usize,
     /// Only print the number of missing runs.
     pub dry_run: bool,
+    /// True to keep the feature maps, for further runs of other settings.
+    pub keep_maps: bool,
 }
 
 /// Reads, prepares and runs an experiment.
@@ -185,10 +188,11 @@ impl Sweep {
         self.compute(&missing, options.jobs)?;
         let cells: Option<Vec<Cell>> = self.known()?.into_iter().collect();
         let cells = cells.ok_or_else(|| SweepError::Worker("a run that was done is not there".into()))?;
-        Ok(Swept {
-            table: self.write(&cells)?,
-            left_out: cells.into_iter().map(|cell| cell.metrics.left_out).collect(),
-        })
+        let table = self.write(&cells)?;
+        if !options.keep_maps {
+            self.remove_maps()?;
+        }
+        Ok(Swept { table, left_out: cells.into_iter().map(|cell| cell.metrics.left_out).collect() })
     }
 
     /// Prints the number of runs and the estimated time.
@@ -303,7 +307,17 @@ impl Sweep {
         Ok(())
     }
 
-    /// Writes table, charts and report.
+    /// Removes the feature maps, which are most of what a sweep writes and are of no use once all runs are cached.
+    fn remove_maps(&self) -> Result<(), SweepError> {
+        match fs::remove_dir_all(self.maps()) {
+            Err(source) if source.kind() != io::ErrorKind::NotFound => {
+                Err(SweepError::Io { path: self.maps(), source })
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// Writes table, charts and report; returns the table for a terminal.
     fn write(&self, cells: &[Cell]) -> Result<String, SweepError> {
         let text = csv(&self.experiment, cells);
         let write = |name: &str, text: &str| {
@@ -323,7 +337,8 @@ impl Sweep {
         let spec =
             fs::read_to_string(&self.file).map_err(|source| SweepError::Io { path: self.file.clone(), source })?;
         write("report.html", &html::page(&self.experiment, &spec, cells, &drawings))?;
-        Ok(text)
+        let (columns, lines) = table::rows(&self.experiment, cells);
+        Ok(VaryingTable::new(&columns, &lines).text())
     }
 }
 

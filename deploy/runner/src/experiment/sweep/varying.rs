@@ -1,9 +1,13 @@
-//! Columns of a sweep's table that vary, as its report shows them, and what is seen in them.
+//! Columns of a sweep's table that vary, as its report and the terminal show them, and what is seen in them.
+
+use support::text_table::{Side, TextTable};
 
 /// Columns that are shown first, and in whose highest value a reader is interested.
 const PRECISIONS: [&str; 3] = ["ap_global_30", "ap_global_50", "ap_global_70"];
 /// The one that the sentence is about.
 const MAIN: &str = "ap_global_50";
+/// Further results that fit on a terminal.
+const KEY_RESULTS: [&str; 4] = ["log2_wire", "e2e_ms_p50", "e2e_ms_p95", "frames_used"];
 /// Last column that an experiment sets; those after it are results.
 const LAST_SETTING: &str = "seed";
 
@@ -56,6 +60,29 @@ impl VaryingTable {
         Some(format!("AP@0.5 is between {low:.3} ({worst}) and {high:.3} ({best})."))
     }
 
+    /// The table for a terminal: settings, precisions, and of the other results those that fit; then the sentence.
+    pub(super) fn text(&self) -> String {
+        let is_shown = |place: &usize| {
+            let name = self.columns[*place].as_str();
+            *place < self.settings || PRECISIONS.contains(&name) || KEY_RESULTS.contains(&name)
+        };
+        let shown: Vec<usize> = (0..self.columns.len()).filter(is_shown).collect();
+        let side = |place: usize| {
+            let is_number = (0..self.lines.len())
+                .all(|line| self.lines[line][place].is_empty() || self.number(line, place).is_some());
+            if is_number { Side::Right } else { Side::Left }
+        };
+        let mut table = TextTable::new(shown.iter().map(|&place| (self.columns[place].as_str(), side(place))));
+        for line in &self.lines {
+            table.row(shown.iter().map(|&place| match line[place].as_str() {
+                "" => "-".to_owned(),
+                value => value.to_owned(),
+            }));
+        }
+        let sentence = self.sentence().map_or(String::new(), |sentence| format!("{sentence}\n"));
+        format!("{table}{sentence}")
+    }
+
     fn settings_of(&self, line: usize) -> String {
         let pairs = self.columns.iter().zip(&self.lines[line]).take(self.settings);
         pairs
@@ -91,6 +118,9 @@ mod tests {
         assert_eq!(table.constants, constants.map(|(name, value)| (name.to_owned(), value.to_owned())));
         assert!(table.is_best(0, 1) && !table.is_best(1, 1) && !table.is_best(0, 2));
         assert_eq!(table.sentence().unwrap(), "AP@0.5 is between 0.800 (loss 0.1) and 0.900 (loss 0).");
+        let text = table.text();
+        assert_eq!(text.lines().next().unwrap(), "loss  ap_global_50  e2e_ms_p50");
+        assert!(text.ends_with("0.900 (loss 0).\n") && text.lines().count() == 4, "{text}");
         assert_eq!(VaryingTable::new(&columns, &lines[..1]).sentence(), None);
     }
 }

@@ -1,0 +1,124 @@
+//! Traffic of each link over a recorded run: rate, time on the link and backlog, from one scene frame to the next.
+
+use std::collections::BTreeMap;
+
+use protocol::{CavId, HEADER_LEN, Stream, Topic};
+use recording::Entry;
+use serde::Serialize;
+
+/// Traffic of the link from one vehicle to an ego, for one scene frame.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub(crate) struct LinkTraffic {
+    /// The sender.
+    pub from: CavId,
+    /// Bytes of its messages for this frame.
+    pub sent_bytes: u64,
+    /// From publication to arrival of the last of these to arrive, milliseconds; `None`: none has arrived.
+    pub transit_ms: Option<f64>,
+    /// Bytes that were on their way when the tick was published: of earlier messages, those that arrived later.
+    /// Messages that were lost do not count.
+    pub waiting_bytes: Option<u64>,
+}
+
+/// Messages of all links to one ego.
+#[derive(Debug, Default)]
+pub(super) struct LinkSeries {
+    links: BTreeMap<CavId, LinkMessages>,
+}
+
+#[derive(Debug, Default)]
+struct LinkMessages {
+    /// Bytes by capture time.
+    sent: BTreeMap<u64, u64>,
+    /// Longest time from publication to arrival by capture time, milliseconds.
+    transit_ms: BTreeMap<u64, f64>,
+    /// Bytes of those that arrived, by time of publication.
+    published: Vec<(u64, u64)>,
+    /// The same by time of arrival.
+    arrived: Vec<(u64, u64)>,
+}
+
+impl LinkSeries {
+    /// Collects the messages to `ego`. Where there is no link emulation, they arrive when the recorder has them.
+    pub(super) fn new(entries: &[Entry], ego: &CavId) -> Self {
+        let arrives = |entry: &&Entry| matches!(&entry.key.topic, Topic::Received { ego: to, .. } if to == ego);
+        let is_emulated = entries.iter().any(|entry| arrives(&entry));
+        let mut series = Self::default();
+        for entry in entries {
+            let (cav, stream, is_sent, is_arrived) = match &entry.key.topic {
+                Topic::Stream { cav, stream } if cav != ego => (cav, *stream, true, !is_emulated),
+                Topic::Received { cav, stream, ego: to } if to == ego => (cav, *stream, false, true),
+                _ => continue,
+            };
+            if !matches!(stream, Stream::Pose | Stream::Bev | Stream::Boxes | Stream::Points) {
+                continue;
+            }
+            let link = series.links.entry(cav.clone()).or_default();
+            let (stamp, bytes) = (&entry.header.stamp, bytes(entry));
+            if is_sent {
+                *link.sent.entry(stamp.capture_nanos).or_default() += bytes;
+            }
+            if is_arrived {
+                let transit_ms = (entry.arrived_nanos as f64 - stamp.publish_nanos as f64) / 1e6;
+                let longest = link.transit_ms.entry(stamp.capture_nanos).or_insert(transit_ms);
+                *longest = longest.max(transit_ms);
+                link.published.push((stamp.publish_nanos, bytes));
+                link.arrived.push((entry.arrived_nanos, bytes));
+            }
+        }
+        for link in series.links.values_mut() {
+            accumulate(&mut link.published);
+            accumulate(&mut link.arrived);
+        }
+        series
+    }
+
+    /// Traffic of every link for the frame of a capture time, whose tick was published at `began_nanos`.
+    pub(super) fn at(&self, capture_nanos: u64, began_nanos: Option<u64>) -> Vec<LinkTraffic> {
+        let traffic = |(from, link): (&CavId, &LinkMessages)| LinkTraffic {
+            from: from.clone(),
+            sent_bytes: link.sent.get(&capture_nanos).copied().unwrap_or(0),
+            transit_ms: link.transit_ms.get(&capture_nanos).copied(),
+            waiting_bytes: began_nanos.map(|now| until(&link.published, now).saturating_sub(until(&link.arrived, now))),
+        };
+        self.links.iter().map(traffic).collect()
+    }
+}
+
+fn bytes(entry: &Entry) -> u64 {
+    HEADER_LEN as u64 + u64::from(entry.header.metadata_len) + entry.header.body_len
+}
+
+/// Sorts by time and replaces bytes by the sum of all bytes so far.
+fn accumulate(messages: &mut [(u64, u64)]) {
+    messages.sort_unstable();
+    let mut sum = 0_u64;
+    for (_, bytes) in messages {
+        sum = sum.saturating_add(*bytes);
+        *bytes = sum;
+    }
+}
+
+/// Sum of the bytes until a time, which counts.
+fn until(accumulated: &[(u64, u64)], nanos: u64) -> u64 {
+    let count = accumulated.partition_point(|(at, _)| *at <= nanos);
+    count.checked_sub(1).and_then(|last| accumulated.get(last)).map_or(0, |(_, sum)| *sum)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_backlog_is_what_was_published_and_has_not_arrived() {
+        let link = |pairs: &[(u64, u64)]| {
+            let mut messages = pairs.to_vec();
+            accumulate(&mut messages);
+            messages
+        };
+        // 100 bytes at 10, 200 at 20 and 300 at 30; they arrive in another order.
+        let (published, arrived) = (link(&[(20, 200), (10, 100), (30, 300)]), link(&[(25, 100), (60, 200), (40, 300)]));
+        let waiting = |now| until(&published, now) - until(&arrived, now);
+        assert_eq!([0, 10, 24, 25, 30, 40, 60].map(waiting), [0, 100, 300, 200, 500, 200, 0]);
+    }
+}
