@@ -110,6 +110,8 @@ class RecordedPage(Checks):
         self.images()
         self.navigation()
         self.judgement()
+        self.links()
+        self.feature_map(pictures)
         self.skipped_tick(pictures)
         self.selection()
         self.none("every colour of the scene is in the legend", self.tab.value("probe.unexplained()"))
@@ -168,6 +170,28 @@ class RecordedPage(Checks):
         self.same("counts at the lowest score", tab.value(text("#judged")), counts(frame, 0.1))
         tab.value("probe.setScore(0.2)")
         self.open_legend(False)
+
+    def links(self) -> None:
+        index = self.answered[-1]
+        self.goes_to(index)
+        mbps = "\\d+\\.\\d+ Mbit/s, \\d+(\\.\\d)? ms on the link, \\d.* waiting"
+        self.becomes("rate, time and backlog of the links", "#serieshead", mbps)
+        dark = self.tab.value("probe.strokes('series')")
+        self.true("a line for each link in every strip", dark >= 3, f"{dark} lines")
+
+    def feature_map(self, pictures) -> None:
+        tab = self.tab
+        self.goes_to(self.answered[-1])
+        self.open_legend(True)
+        self.same("no feature map at first", tab.value("heat.image"), None)
+        tab.value("probe.layer('feature map')")
+        tab.wait("heat.image !== null")
+        self.same("a feature map is drawn", tab.value("probe.maps()"), 1)
+        self.same("of this moment", tab.value("heat.capture_s === view.frame.capture_s"), True)
+        self.open_legend(False)
+        tab.screenshot(pictures("feature-map"))
+        tab.value("probe.layer('feature map')")
+        self.same("and can be hidden", tab.value("probe.maps()"), 0)
 
     def open_legend(self, is_open: bool) -> None:
         """On a phone the legend is closed at first."""
@@ -244,10 +268,22 @@ class LivePage(Checks):
         self.becomes("AP", "#precision", "^\\d+\\.\\d %$")
         self.none("every colour of the scene is in the legend", self.tab.value("probe.unexplained()"))
         self.images(20)
+        self.tab.wait("document.getElementById('seriesbox').checkVisibility()", 20)
+        self.becomes("rate and time of the links", "#serieshead", "Mbit/s, .* on the link", 20)
         self.tab.screenshot(pictures("live"))
+        self.other_ego()
         for has_router, words in ((True, "last message 4 s ago"), (False, "router gone, last message 4 s ago")):
             status = {"silent_s": 4.2, "is_over": False, "has_router": has_router}
             self.same("a run that has fallen silent", self.tab.value(f"probe.stateOf({json.dumps(status)})"), words)
+
+    def other_ego(self) -> None:
+        self.tab.wait("document.querySelectorAll('#ego option').length === 2", 20)
+        shown, other = self.tab.value("[view.answered.ego, [...document.querySelectorAll('#ego option')].map((one) => one.value).find((one) => one !== view.answered.ego)]")
+        self.tab.value(f"probe.select('#ego', '{other}')")
+        self.tab.wait(f"view.answered && view.answered.ego === '{other}'", 20)
+        self.same("another ego's view", self.tab.value("view.answered.ego"), other)
+        self.tab.value(f"probe.select('#ego', '{shown}')")
+        self.tab.wait(f"view.answered && view.answered.ego === '{shown}'", 20)
 
     def ends(self, pictures) -> None:
         self.becomes("says that the run has ended", "#state", "^ended \\d+(\\.\\d)? s ago$", 8)

@@ -2,11 +2,12 @@
 // Probe of the page of `v2vloc view` and of a sweep's report: loaded before their scripts by page_checks.py, returns plain
 // values. Keeps what is drawn on the scene: paths with their colour, and texts.
 
-const probe = { drawn: [] };
+const probe = { drawn: [], lines: {} };
 
 for (const [name, style] of [["stroke", "strokeStyle"], ["fill", "fillStyle"], ["fillText", "fillStyle"]]) {
   const original = CanvasRenderingContext2D.prototype[name];
   CanvasRenderingContext2D.prototype[name] = function (...given) {
+    if (name === "stroke" && this.canvas.id) probe.lines[this.canvas.id] = (probe.lines[this.canvas.id] || 0) + 1;
     if (this.canvas.id === "scene") probe.drawn.push({ name, colour: this[style], path: [...(this.path || [])] });
     return original.apply(this, given);
   };
@@ -24,6 +25,36 @@ probe.scene = () => {
   probe.drawn.length = 0;
   draw();
   return probe.drawn;
+};
+
+/// Number of feature maps in one drawing of the scene.
+probe.pictures = 0;
+const drawImage = CanvasRenderingContext2D.prototype.drawImage;
+CanvasRenderingContext2D.prototype.drawImage = function (...given) {
+  probe.pictures += 1;
+  return drawImage.apply(this, given);
+};
+probe.maps = () => {
+  probe.pictures = 0;
+  draw();
+  return probe.pictures;
+};
+
+/// Number of lines that one drawing of a chart consists of.
+probe.strokes = (id) => {
+  probe.lines[id] = 0;
+  series();
+  return probe.lines[id];
+};
+
+/// Switches a layer of the legend.
+probe.layer = (name) => [...document.querySelectorAll("#legend label")].find((label) => label.textContent.includes(name)).querySelector("input").click();
+
+/// Chooses an entry of a list, as a person does.
+probe.select = (selector, value) => {
+  const list = document.querySelector(selector);
+  list.value = value;
+  list.dispatchEvent(new Event("change"));
 };
 
 /// A colour, or a property of the style sheet that holds one, as the canvas spells it.

@@ -3,6 +3,8 @@
 use protocol::{Bev, BevFeatures, BevGrid, Limits, wire};
 use serde_json::json;
 
+/// Quantile of the activations up to which the level is 0: most of a map is empty ground, whose activations are not 0.
+const EMPTY: f64 = 0.5;
 /// Quantile of the activations that gets the highest level: few cells are far above all others.
 const BRIGHTEST: f64 = 0.99;
 
@@ -51,15 +53,14 @@ fn activations(features: &BevFeatures) -> Vec<f32> {
     sums
 }
 
-/// Activations between the lowest and the brightest as 0..=255. The lowest is that of empty ground, which biases make
-/// other than zero.
+/// Activations between those of empty ground and the brightest as 0..=255.
 fn levels(activations: &[f32]) -> Vec<u8> {
     let mut sorted: Vec<f32> = activations.iter().copied().filter(|value| value.is_finite()).collect();
     sorted.sort_by(f32::total_cmp);
     let at = |share: f64| sorted.get((share * sorted.len().saturating_sub(1) as f64).round() as usize).copied();
-    let (lowest, brightest) = (at(0.0).unwrap_or(0.0), at(BRIGHTEST).unwrap_or(0.0));
-    let range = (brightest - lowest).max(f32::MIN_POSITIVE);
-    activations.iter().map(|value| (255.0 * ((value - lowest) / range).clamp(0.0, 1.0)) as u8).collect()
+    let (empty, brightest) = (at(EMPTY).unwrap_or(0.0), at(BRIGHTEST).unwrap_or(0.0));
+    let range = (brightest - empty).max(f32::MIN_POSITIVE);
+    activations.iter().map(|value| (255.0 * ((value - empty) / range).clamp(0.0, 1.0)) as u8).collect()
 }
 
 #[cfg(test)]
@@ -98,7 +99,7 @@ mod tests {
 
     #[test]
     fn values_that_are_not_finite_are_dark_or_bright_and_nothing_fails() {
-        assert_eq!(levels(&[f32::NAN, f32::INFINITY, 0.0, 1.0]), [0, 255, 0, 255]);
+        assert_eq!(levels(&[f32::NAN, f32::INFINITY, 0.0, 0.0, 1.0]), [0, 255, 0, 0, 255]);
         assert_eq!(levels(&[]), [0_u8; 0]);
         assert_eq!(levels(&[2.0, 2.0]), [0, 0]);
     }

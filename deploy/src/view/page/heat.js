@@ -40,10 +40,8 @@ function takeHeat(cav, buffer) {
   [image.width, image.height] = [grid.width, grid.height];
   const pen = image.getContext("2d");
   const pixels = pen.createImageData(grid.width, grid.height);
-  pen.fillStyle = ink(cav);
-  pen.fillRect(0, 0, 1, 1);
-  const shade = pen.getImageData(0, 0, 1, 1).data;
-  levels.forEach((level, cell) => pixels.data.set([shade[0], shade[1], shade[2], BRIGHTEST * level], 4 * cell));
+  const shade = [1, 3, 5].map((place) => parseInt(ink(cav).slice(place, place + 2), 16));
+  levels.forEach((level, cell) => pixels.data.set([...shade, BRIGHTEST * level], 4 * cell));
   pen.putImageData(pixels, 0, 0);
   Object.assign(heat, { cav, capture_s: captured, grid, image });
 }

@@ -73,7 +73,8 @@ function chart(entries, known, now) {
     pen.fillRect(0, bottom, width, 1);
     for (const from of froms) {
       pen.strokeStyle = ink(from);
-      pen.lineWidth = 1.5;
+      pen.lineWidth = 2;
+      pen.lineCap = "round";
       pen.beginPath();
       let isDown = false;
       for (const entry of entries) {
@@ -81,7 +82,10 @@ function chart(entries, known, now) {
         const value = link ? of(link) : null;
         // A gap where nothing is known.
         if (!isKnown(value)) { isDown = false; continue; }
-        pen[isDown ? "lineTo" : "moveTo"](x(entry.capture_s), bottom - (bottom - top) * value / (most || 1));
+        const at = [x(entry.capture_s), bottom - (bottom - top) * value / (most || 1)];
+        // A line to the same place is a dot, for a value between two gaps.
+        if (!isDown) pen.moveTo(...at);
+        pen.lineTo(...at);
         isDown = true;
       }
       pen.stroke();
