@@ -99,7 +99,7 @@ pub fn train_encoder(
         training.step(&loader.next_batch()??, &mut window)?;
         training.trainer.check_interruption(&training.variables)?;
         let step = training.trainer.steps();
-        if step.is_multiple_of(REPORT_EVERY) {
+        if training.trainer.is_report_due(REPORT_EVERY) {
             observe(&training.report(std::mem::take(&mut window))?);
         }
         if step.is_multiple_of(config.validate_every) || training.share_done() >= 1.0 {

@@ -92,7 +92,7 @@ pub fn train_sgloc(
         trainer.step(&loss, share_done(&trainer))?;
         trainer.check_interruption(&variables)?;
         let step = trainer.steps();
-        if step.is_multiple_of(REPORT_EVERY) {
+        if trainer.is_report_due(REPORT_EVERY) {
             let error_m = window.iter().sum::<f64>() / window.len() as f64;
             window.clear();
             let share_done = share_done(&trainer).min(1.0);

@@ -129,6 +129,12 @@ impl Trainer {
         self.progress.step
     }
 
+    /// True after the first step, so that a user soon sees what a step costs, and after every `period` steps.
+    #[must_use]
+    pub fn is_report_due(&self, period: u64) -> bool {
+        self.progress.step == 1 || self.progress.step.is_multiple_of(period)
+    }
+
     /// Seconds spent, in all runs together.
     #[must_use]
     pub fn seconds(&self) -> f64 {

@@ -149,7 +149,7 @@ impl Training<'_> {
             self.trainer.check_interruption(&self.variables)?;
             noise.push(losses.noise);
             let step = self.trainer.steps();
-            if step.is_multiple_of(REPORT_EVERY) || self.share_done() >= 1.0 {
+            if self.trainer.is_report_due(REPORT_EVERY) || self.share_done() >= 1.0 {
                 let noise_l1 = Tensor::f_stack(&noise, 0)?.f_mean(None)?.f_double_value(&[])?;
                 noise.clear();
                 let seconds = self.trainer.seconds();

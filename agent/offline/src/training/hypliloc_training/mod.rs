@@ -77,6 +77,7 @@ pub fn train_hypliloc(
     Cuda::cudnn_set_benchmark(run.device.is_cuda());
     let share_done =
         |trainer: &Trainer| trainer.share_done((trainer.steps() * run.batch as u64) as f64 / examples.len() as f64);
+    let mut reported = trainer.steps();
     let mut errors = Tensor::f_zeros([2], (Kind::Float, run.device))?;
     while share_done(&trainer) < 1.0 {
         let (batch, truth) = augment(examples.draw(run.batch as i64)?)?;
@@ -86,8 +87,10 @@ pub fn train_hypliloc(
         trainer.check_interruption(&variables)?;
         errors += mean_errors(&poses.fusion, &truth, &examples.scale_m)?;
         let step = trainer.steps();
-        if step.is_multiple_of(REPORT_EVERY) {
-            let mean: Vec<f64> = Vec::try_from(&(&errors / REPORT_EVERY as f64).f_to_kind(Kind::Double)?)?;
+        if trainer.is_report_due(REPORT_EVERY) {
+            let steps = (step - reported) as f64;
+            reported = step;
+            let mean: Vec<f64> = Vec::try_from(&(&errors / steps).f_to_kind(Kind::Double)?)?;
             let _ = errors.f_zero_()?;
             let share_done = share_done(&trainer).min(1.0);
             let (error_m, error_deg) = (mean[0], mean[1].to_degrees());

@@ -81,7 +81,7 @@ pub(crate) fn train_scene_on(
     while training.share_done() < 1.0 {
         training.step()?;
         training.trainer.check_interruption(&training.variables)?;
-        if training.trainer.steps().is_multiple_of(REPORT_EVERY) {
+        if training.trainer.is_report_due(REPORT_EVERY) {
             observe(&training.report());
         }
         if last_validation.elapsed() >= config.validate_every {
