@@ -8,7 +8,7 @@
 //! | `replay` | sensors of every vehicle and previews of them, the truth, the end of the scene | control, readiness, detections |
 //! | `scorer` | control | the truth, detections, poses, statistics |
 //! | `recorder` | nothing | everything but previews |
-//! | `viewer` | nothing | results, descriptors, previews of sweeps, images, statistics |
+//! | `viewer` | nothing | results, descriptors, previews of sweeps, feature maps, images, statistics |
 //! | `ros2` | sweeps and motion of every vehicle | sweeps, motion, poses, detections, statistics |
 //!
 //! In addition every process declares a liveliness token and publishes its readiness and its ledger, each under its own
@@ -114,7 +114,8 @@ impl Principal {
             }
             Role::Recorder => (Vec::new(), vec![keys(&"**")]),
             Role::Viewer => {
-                let shown = [Stream::Pose, Stream::Boxes, Stream::Detections, Stream::Preview, Stream::Descriptor];
+                use Stream::{Bev, Boxes, Descriptor, Detections, Pose, Preview};
+                let shown = [Pose, Boxes, Detections, Preview, Descriptor, Bev];
                 let shown = shown.iter().map(|stream| everyones(stream));
                 let rest = ["*/camera/*", "rx/*/*/pose", "truth", "stats/*", "control/*"].map(|topic| keys(&topic));
                 (Vec::new(), shown.chain(rest).collect::<Vec<_>>())
