@@ -11,11 +11,15 @@ use tch::{Device, Kind, Tensor, no_grad};
 use super::{SgLoc, SgLocConfig};
 use crate::baselines::regressed_pose::no_pose;
 use crate::pgc::error::LocalizerError;
-use crate::pgc::localize::{CELLS, Localization, Localize, LocalizerTimes, SceneCoordinates, choose_evenly};
+use crate::pgc::localize::{Localization, Localize, LocalizerTimes, SceneCoordinates, choose_evenly};
 use crate::pgc::pose_solver::{MIN_CELLS, PoseSolver};
 use crate::pgc::scene_encoder::SceneFeatures;
 use crate::pgc::voxel_batch::VoxelBatch;
 use crate::pgc::voxelise::SweepVoxels;
+
+/// Largest number of cells of a sweep that are regressed: coordinates are less accurate than PGC's, and more of them make
+/// up for it.
+const CELLS: usize = 1024;
 
 /// Network and solver.
 ///
