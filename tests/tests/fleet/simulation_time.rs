@@ -317,12 +317,18 @@ fn a_sweep_is_the_same_csv_in_one_process_and_in_many() {
     );
     assert!(text_of(&dry).contains("minutes for 24 runs with 2 jobs"), "{}", text_of(&dry));
 
-    let [one, many] = [("one", "1"), ("many", "3")].map(|(out, jobs)| sweep(folder.path(), out, jobs, &[]));
+    let [one, many] = [("one", "1", [].as_slice()), ("many", "3", &["--keep-maps"])]
+        .map(|(out, jobs, more)| sweep(folder.path(), out, jobs, more));
     assert!(one.status.success() && many.status.success(), "{}\n{}", text_of(&one), text_of(&many));
     let read = |out: &str, name: &str| fs::read_to_string(folder.path().join(out).join(name)).unwrap();
+    let has_maps = |out: &str| folder.path().join(out).join("maps").exists();
+    assert!(!has_maps("one") && has_maps("many"), "maps are kept on request");
     let csv = read("one", "e.csv");
     assert_eq!(csv, read("many", "e.csv"));
-    assert_eq!(String::from_utf8_lossy(&one.stdout), csv);
+    let table = String::from_utf8_lossy(&one.stdout).into_owned();
+    assert!(table.starts_with("method  dtype  keep  latency_ms  bandwidth_mbps  ap_global_30"), "{table}");
+    assert!(table.lines().count() == 26 && table.contains("AP@0.5 is between"), "{table}");
+    assert!(table.lines().take(25).all(|line| line.len() <= 120), "{table}");
     assert_eq!(read("one", "report.html"), read("many", "report.html"));
     let lines: Vec<Vec<&str>> = csv.lines().map(|line| line.split(',').collect()).collect();
     assert!(lines.len() == 25 && lines.iter().all(|line| line.len() == lines[0].len()), "{csv}");

@@ -6,7 +6,11 @@ use support::text_table::{Side, TextTable};
 const PRECISIONS: [&str; 3] = ["ap_global_30", "ap_global_50", "ap_global_70"];
 /// The one that the sentence is about.
 const MAIN: &str = "ap_global_50";
-/// Further results that fit on a terminal.
+/// Characters of a line of a terminal.
+const TERMINAL: usize = 120;
+/// Characters between two columns.
+const GAP: usize = 2;
+/// Further results, shown as far as a line has room for them.
 const KEY_RESULTS: [&str; 4] = ["log2_wire", "e2e_ms_p50", "e2e_ms_p95", "frames_used"];
 /// Last column that an experiment sets; those after it are results.
 const LAST_SETTING: &str = "seed";
@@ -62,11 +66,21 @@ impl VaryingTable {
 
     /// The table for a terminal: settings, precisions, and of the other results those that fit; then the sentence.
     pub(super) fn text(&self) -> String {
-        let is_shown = |place: &usize| {
-            let name = self.columns[*place].as_str();
-            *place < self.settings || PRECISIONS.contains(&name) || KEY_RESULTS.contains(&name)
+        let name = |place: usize| self.columns[place].as_str();
+        let width = |place: usize| {
+            let cells = self.lines.iter().map(|line| line[place].len());
+            GAP + cells.chain([name(place).len()]).max().unwrap_or(0)
         };
-        let shown: Vec<usize> = (0..self.columns.len()).filter(is_shown).collect();
+        let mut shown: Vec<usize> = (0..self.columns.len())
+            .filter(|&place| place < self.settings || PRECISIONS.contains(&name(place)))
+            .collect();
+        let mut used: usize = shown.iter().map(|&place| width(place)).sum();
+        for place in (self.settings..self.columns.len()).filter(|&place| KEY_RESULTS.contains(&name(place))) {
+            used += width(place);
+            if used <= TERMINAL {
+                shown.push(place);
+            }
+        }
         let side = |place: usize| {
             let is_number = (0..self.lines.len())
                 .all(|line| self.lines[line][place].is_empty() || self.number(line, place).is_some());
