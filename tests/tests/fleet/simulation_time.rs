@@ -327,8 +327,8 @@ fn a_sweep_is_the_same_csv_in_one_process_and_in_many() {
     assert_eq!(csv, read("many", "e.csv"));
     let table = String::from_utf8_lossy(&one.stdout).into_owned();
     assert!(table.starts_with("method  dtype  keep  latency_ms  bandwidth_mbps  ap_global_30"), "{table}");
-    assert!(table.lines().count() == 26 && table.contains("AP@0.5 is between"), "{table}");
-    assert!(table.lines().take(25).all(|line| line.len() <= 120), "{table}");
+    // Random weights detect nothing, so no run is said to be the best.
+    assert!(table.lines().count() == 25 && table.lines().all(|line| line.len() <= 120), "{table}");
     assert_eq!(read("one", "report.html"), read("many", "report.html"));
     let lines: Vec<Vec<&str>> = csv.lines().map(|line| line.split(',').collect()).collect();
     assert!(lines.len() == 25 && lines.iter().all(|line| line.len() == lines[0].len()), "{csv}");
