@@ -85,8 +85,8 @@ impl FrameAssembler {
         Self { areas, ledgers, egos, ego, ..Self::default() }
     }
 
-    /// Adds a message. A result of the ego completes its scene frame, which is returned; so is a scene frame without a result when
-    /// too many wait. Invalid messages are ignored here and counted by their receivers.
+    /// Adds a message. A result of the ego completes its scene frame, which is returned; so is a scene frame without a
+    /// result when too many wait. Invalid messages are ignored here and counted by their receivers.
     pub(crate) fn add(&mut self, seen: &ReceivedMessage<'_>) -> Option<SceneFrame> {
         if let Topic::Stats(_) = seen.topic {
             self.keep_ledger(seen);
@@ -167,7 +167,11 @@ impl FrameAssembler {
                 }
             }
             Topic::Stream { cav, stream: Stream::Detections } => {
-                if let Some(result) = decode(seen).filter(|_| self.shows_results_of(cav)) {
+                self.egos.insert(cav.clone());
+                if self.ego.is_none() {
+                    self.ego = Some(cav.clone());
+                }
+                if let Some(result) = decode(seen).filter(|_| self.ego.as_ref() == Some(cav)) {
                     self.frame(at).result = Some((published, result));
                     return true;
                 }
@@ -201,11 +205,6 @@ impl FrameAssembler {
             Topic::Control(_) | Topic::Ready(_) | Topic::Stats(_) | Topic::Alive { .. } => {}
         }
         false
-    }
-
-    fn shows_results_of(&mut self, ego: &CavId) -> bool {
-        self.egos.insert(ego.clone());
-        self.ego.get_or_insert_with(|| ego.clone()) == ego
     }
 
     fn arrived(&mut self, at: u64, cav: &CavId, stream: Stream, rank: u8, seen: &ReceivedMessage<'_>) {

@@ -141,8 +141,9 @@ impl LiveRun {
         lock(&self.newest).values().map(|newest| newest.receiver_count()).sum()
     }
 
-    /// Scene frames of an ego (`None`: the first with results) for one page, each after its length (32 bits, little-endian; 0: nothing new): the newest whenever
-    /// the page has taken the previous one, until `limit` of them or the end of the run.
+    /// Scene frames of an ego (`None`: the first with results) for one page, each after its length (32 bits,
+    /// little-endian; 0: nothing new): the newest whenever the page has taken the previous one, until `limit` of them or
+    /// the end of the run.
     pub fn moments(&self, limit: Option<u64>, ego: Option<CavId>) -> impl Pieces<Item = Bytes> + Send + use<> {
         let newest = self.subscribe(ego);
         stream::unfold((newest, limit, Duration::ZERO), |(mut newest, left, pause)| async move {
@@ -160,12 +161,12 @@ impl LiveRun {
             }
         })
     }
-}
 
-impl LiveRun {
+    /// Beyond [`MOST_EGOS`], those of the first ego with results.
     fn subscribe(&self, ego: Option<CavId>) -> watch::Receiver<Bytes> {
         let mut newest = lock(&self.newest);
-        let ego = ego.filter(|_| newest.len() <= MOST_EGOS);
+        let has_room = newest.len() <= MOST_EGOS || newest.contains_key(&ego);
+        let ego = ego.filter(|_| has_room);
         newest.entry(ego).or_default().subscribe()
     }
 }

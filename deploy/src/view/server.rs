@@ -62,8 +62,10 @@ pub fn serve_recorded(address: SocketAddr, run: Arc<RecordedRun>) -> io::Result<
         let ego = ego_of(&request.query);
         if request.path == "/run" {
             let timeline = run.timeline(ego.as_ref());
+            let (egos, cameras) = (run.egos(), run.cameras());
+            let run = run.name();
             return document(
-                &json!({"mode": "recorded", "run": run.name(), "timeline": timeline, "cameras": run.cameras()}),
+                &json!({"mode": "recorded", "run": run, "egos": egos, "timeline": timeline, "cameras": cameras}),
             );
         }
         let index = number_of("at", &request.query).and_then(|index| usize::try_from(index).ok()).unwrap_or(0);

@@ -10,7 +10,7 @@ mod sweep_encoder;
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Write};
 use std::os::unix::fs::FileExt;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use dataset::{self, IntensityScale, LoadOptions, ReadError, Scenario};
@@ -197,6 +197,12 @@ impl FeatureStore {
         let features = decode().map_err(|source| FeatureStoreError::Wire { path: self.path.clone(), source })?.features;
         let size = [1, i64::from(features.channels), i64::from(features.grid.height), i64::from(features.grid.width)];
         Ok(Some(Tensor::f_from_slice(&features.values)?.f_view(size)?))
+    }
+
+    /// File of the maps.
+    #[must_use]
+    pub fn path(&self) -> &Path {
+        &self.path
     }
 
     /// The index of a scenario.

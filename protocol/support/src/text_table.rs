@@ -4,6 +4,9 @@ use std::fmt;
 
 use comfy_table::{CellAlignment, Table, presets};
 
+/// Characters between two columns.
+pub const GAP: u16 = 2;
+
 /// Alignment of the cells of a column.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Side {
@@ -25,7 +28,7 @@ impl TextTable {
         let mut table = Table::new();
         table.load_style(presets::NOTHING).set_header(names);
         for (column, side) in table.column_iter_mut().zip(sides) {
-            column.set_padding((0, 2));
+            column.set_padding((0, GAP));
             column.set_cell_alignment(match side {
                 Side::Left => CellAlignment::Left,
                 Side::Right => CellAlignment::Right,

@@ -317,12 +317,16 @@ fn a_sweep_is_the_same_csv_in_one_process_and_in_many() {
     );
     assert!(text_of(&dry).contains("minutes for 24 runs with 2 jobs"), "{}", text_of(&dry));
 
+    let foreign = folder.path().join("one/maps/of-another-program.maps");
+    fs::create_dir_all(foreign.parent().unwrap()).unwrap();
+    fs::write(&foreign, b"").unwrap();
     let [one, many] = [("one", "1", [].as_slice()), ("many", "3", &["--keep-maps"])]
         .map(|(out, jobs, more)| sweep(folder.path(), out, jobs, more));
     assert!(one.status.success() && many.status.success(), "{}\n{}", text_of(&one), text_of(&many));
     let read = |out: &str, name: &str| fs::read_to_string(folder.path().join(out).join(name)).unwrap();
-    let has_maps = |out: &str| folder.path().join(out).join("maps").exists();
-    assert!(!has_maps("one") && has_maps("many"), "maps are kept on request");
+    let maps = |out: &str| fs::read_dir(folder.path().join(out).join("maps")).unwrap().count();
+    assert!(maps("one") == 1 && foreign.exists(), "only the sweep's own maps are removed");
+    assert!(maps("many") > 0, "maps are kept on request");
     let csv = read("one", "e.csv");
     assert_eq!(csv, read("many", "e.csv"));
     let table = String::from_utf8_lossy(&one.stdout).into_owned();

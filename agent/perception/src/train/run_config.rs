@@ -59,7 +59,8 @@ impl RunConfig {
         }
     }
 
-    /// Creates the folder of the results, without the checkpoint of an earlier training that is not resumed, and seeds the tensor library; must precede the first draw of a parameter.
+    /// Creates the folder of the results and seeds the tensor library; must precede the first draw of a parameter. Removes
+    /// the checkpoint of an earlier training there, unless it is resumed.
     ///
     /// # Errors
     /// [`TrainingError::Io`] when the folder cannot be created, or the checkpoint not removed.

@@ -68,7 +68,7 @@ async function check() {
   if (!isKnown(silent)) hint("Nothing is published in this run yet.");
 }
 
-const tape = { timeline: [], at: -1, wanted: 0, busy: false, playing: null };
+const tape = { timeline: [], egos: [], at: -1, wanted: 0, busy: false, playing: null };
 
 async function moment(index) {
   const answer = await fetch(ofEgo(`frame/${index}`));
@@ -189,6 +189,9 @@ async function begin() {
   $("run").textContent = run.run;
   document.title = `${run.run} · v2vloc`;
   view.cameras = run.cameras || [];
+  tape.egos = run.egos || [];
+  // A link to an ego without results shows the first one.
+  if (run.mode === "recorded" && !tape.egos.includes(view.ego)) view.ego = null;
   if (run.mode === "live") return watch();
   tape.timeline = run.timeline;
   $("timeline").hidden = false;
@@ -209,7 +212,7 @@ async function begin() {
   });
   addEventListener("hashchange", async (event) => {
     const ego = askedEgo(event.newURL);
-    if (ego !== view.ego) await chooseEgo(ego);
+    if (ego !== view.ego && (!ego || tape.egos.includes(ego))) await chooseEgo(ego);
     await seek(asked(event.newURL));
   });
   state("recorded", "recorded");

@@ -66,7 +66,7 @@ function chart(entries, known, now) {
   const strip = height / known.length;
   known.forEach(([name, written, of], index) => {
     const [top, bottom] = [index * strip + 15, (index + 1) * strip - 3];
-    const most = Math.max(...entries.flatMap(({ links }) => links.map((link) => of(link) ?? 0)));
+    const most = entries.reduce((max, { links }) => links.reduce((so, link) => Math.max(so, of(link) ?? 0), max), 0);
     pen.fillStyle = colour("--faint");
     pen.fillText(most > 0 ? `${name}, up to ${written(most)}` : `${name}: none`, 0, top - 4);
     pen.fillStyle = colour("--grid");

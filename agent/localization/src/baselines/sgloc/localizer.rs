@@ -17,8 +17,7 @@ use crate::pgc::scene_encoder::SceneFeatures;
 use crate::pgc::voxel_batch::VoxelBatch;
 use crate::pgc::voxelise::SweepVoxels;
 
-/// Largest number of cells of a sweep that are regressed: coordinates are less accurate than PGC's, and more of them make
-/// up for it.
+/// Largest number of cells of a sweep that are regressed. More than of PGC: their coordinates are less accurate.
 const CELLS: usize = 1024;
 
 /// Network and solver.

@@ -46,7 +46,7 @@ const PROBED_TICKS: usize = 4;
 /// Result of a sweep.
 #[derive(Debug, Default)]
 pub struct Swept {
-    /// What varies in the table, for a terminal.
+    /// Columns that vary between the runs, as printed on a terminal.
     pub table: String,
     /// Data that each run left out.
     pub left_out: Vec<LeftOut>,
@@ -184,13 +184,13 @@ impl Sweep {
         if options.dry_run {
             return Ok(Swept::default());
         }
-        self.encode(&missing, options.jobs)?;
+        let maps = self.encode(&missing, options.jobs)?;
         self.compute(&missing, options.jobs)?;
         let cells: Option<Vec<Cell>> = self.known()?.into_iter().collect();
         let cells = cells.ok_or_else(|| SweepError::Worker("a run that was done is not there".into()))?;
         let table = self.write(&cells)?;
         if !options.keep_maps {
-            self.remove_maps()?;
+            remove_maps(&maps)?;
         }
         Ok(Swept { table, left_out: cells.into_iter().map(|cell| cell.metrics.left_out).collect() })
     }
@@ -226,8 +226,8 @@ impl Sweep {
         Ok(began.elapsed().as_secs_f64() / metrics.frames.max(1) as f64)
     }
 
-    /// Computes the feature maps of all sweeps, once for each encoder that is needed.
-    fn encode(&self, missing: &[usize], jobs: usize) -> Result<(), SweepError> {
+    /// Computes the feature maps of all sweeps, once for each encoder that is needed; returns their files.
+    fn encode(&self, missing: &[usize], jobs: usize) -> Result<Vec<PathBuf>, SweepError> {
         let methods = missing.iter().map(|&index| self.points[index].method);
         let mut files = Vec::new();
         for method in methods.filter(|method| method.exchange() != Exchange::Points) {
@@ -236,20 +236,22 @@ impl Sweep {
                 files.push(file);
             }
         }
+        let mut stored = Vec::new();
         for file in files {
             let refused = |error: EvaluateError| SweepError::Evaluation(Box::new(error.into()));
             let weights = perception::weights::Weights::load(&file).map_err(|error| refused(error.into()))?;
             let weights = Arc::new(weights.with_precision(self.experiment.precision));
             let bar = progress::bar(0, "sweeps encoded");
             let kept = cell::kept_maps(&self.experiment, &self.maps());
-            let store = FeatureStore::open(&kept, &weights, &self.all, jobs, &mut |stored, all| {
+            let store = FeatureStore::open(&kept, &weights, &self.all, jobs, &mut |done, all| {
                 bar.set_length(all as u64);
-                bar.set_position(stored as u64);
+                bar.set_position(done as u64);
             });
-            store.map_err(|error| refused(Box::new(error).into()))?;
+            let store = store.map_err(|error| refused(Box::new(error).into()))?;
+            stored.push(store.path().to_owned());
             bar.finish_and_clear();
         }
-        Ok(())
+        Ok(stored)
     }
 
     fn compute(&self, missing: &[usize], jobs: usize) -> Result<(), SweepError> {
@@ -307,16 +309,6 @@ impl Sweep {
         Ok(())
     }
 
-    /// Removes the feature maps, which are most of what a sweep writes and are of no use once all runs are cached.
-    fn remove_maps(&self) -> Result<(), SweepError> {
-        match fs::remove_dir_all(self.maps()) {
-            Err(source) if source.kind() != io::ErrorKind::NotFound => {
-                Err(SweepError::Io { path: self.maps(), source })
-            }
-            _ => Ok(()),
-        }
-    }
-
     /// Writes table, charts and report; returns the table for a terminal.
     fn write(&self, cells: &[Cell]) -> Result<String, SweepError> {
         let text = csv(&self.experiment, cells);
@@ -340,6 +332,19 @@ impl Sweep {
         let (columns, lines) = table::rows(&self.experiment, cells);
         Ok(VaryingTable::new(&columns, &lines).text())
     }
+}
+
+/// Removes files of feature maps, which are most of what a sweep writes and are of no use once all runs are cached. Other
+/// files of their folder stay.
+fn remove_maps(files: &[PathBuf]) -> Result<(), SweepError> {
+    for path in files {
+        fs::remove_file(path).map_err(|source| SweepError::Io { path: path.clone(), source })?;
+    }
+    if let Some(folder) = files.first().and_then(|file| file.parent()) {
+        // It stays where it holds anything else.
+        let _ = fs::remove_dir(folder);
+    }
+    Ok(())
 }
 
 /// Generates the data set if it is requested and does not exist.

@@ -1,6 +1,6 @@
 //! Columns of a sweep's table that vary, as its report and the terminal show them, and what is seen in them.
 
-use support::text_table::{Side, TextTable};
+use support::text_table::{GAP, Side, TextTable};
 
 /// Columns that are shown first, and in whose highest value a reader is interested.
 const PRECISIONS: [&str; 3] = ["ap_global_30", "ap_global_50", "ap_global_70"];
@@ -8,8 +8,6 @@ const PRECISIONS: [&str; 3] = ["ap_global_30", "ap_global_50", "ap_global_70"];
 const MAIN: &str = "ap_global_50";
 /// Characters of a line of a terminal.
 const TERMINAL: usize = 120;
-/// Characters between two columns.
-const GAP: usize = 2;
 /// Further results, shown as far as a line has room for them.
 const KEY_RESULTS: [&str; 4] = ["log2_wire", "e2e_ms_p50", "e2e_ms_p95", "frames_used"];
 /// Last column that an experiment sets; those after it are results.
@@ -69,7 +67,7 @@ impl VaryingTable {
         let name = |place: usize| self.columns[place].as_str();
         let width = |place: usize| {
             let cells = self.lines.iter().map(|line| line[place].len());
-            GAP + cells.chain([name(place).len()]).max().unwrap_or(0)
+            usize::from(GAP) + cells.chain([name(place).len()]).max().unwrap_or(0)
         };
         let mut shown: Vec<usize> = (0..self.columns.len())
             .filter(|&place| place < self.settings || PRECISIONS.contains(&name(place)))
