@@ -151,18 +151,18 @@ impl Shared {
     fn keep(&self, raw_message: RawMessage) {
         let len = raw_message.len();
         let waiting = self.waiting_bytes.fetch_add(len, Ordering::Relaxed);
-        let lost = if waiting + len > MAX_WAITING {
-            Some(len)
+        let (left_out, is_lost) = if waiting + len > MAX_WAITING {
+            (len, true)
         } else {
             match self.queue.push(raw_message.key.topic.clone(), raw_message) {
-                PushOutcome::Queued => None,
-                PushOutcome::Replaced(lost) | PushOutcome::NoLane(lost) | PushOutcome::Closed(lost) => Some(lost.len()),
+                PushOutcome::Queued => return,
+                PushOutcome::Replaced(lost) | PushOutcome::NoLane(lost) => (lost.len(), true),
+                // Sent after the end of the capture, such as the last reports of other processes.
+                PushOutcome::Closed(late) => (late.len(), false),
             }
         };
-        if let Some(len) = lost {
-            self.waiting_bytes.fetch_sub(len, Ordering::Relaxed);
-            self.overwritten.fetch_add(1, Ordering::Relaxed);
-        }
+        self.waiting_bytes.fetch_sub(left_out, Ordering::Relaxed);
+        self.overwritten.fetch_add(u64::from(is_lost), Ordering::Relaxed);
     }
 }
 
@@ -206,5 +206,8 @@ mod tests {
         assert_eq!(passive.shared.waiting_bytes.load(Ordering::Relaxed), 0);
         passive.shared.keep(raw_message(9, &payload));
         assert_eq!(passive.overwritten(), 4, "there is room again");
+        passive.closer()();
+        passive.shared.keep(raw_message(10, &payload));
+        assert_eq!(passive.overwritten(), 4, "after the end of the capture");
     }
 }
