@@ -14,7 +14,7 @@ use tch::Tensor;
 use crate::rate::{RateConfig, RateControl};
 use localization::pose_source::{PoseInput, PoseSource};
 use perception::boxes::postprocess::{AgentBoxes, PostprocessConfig, postprocess};
-use perception::detector::{Detector, DetectorError};
+use perception::detector::{BackboneLevel, Detector, DetectorError, Encoded};
 
 /// All inputs of one sweep.
 #[derive(Debug, Clone, Copy)]
@@ -62,6 +62,12 @@ pub struct Agent {
     detector: Detector,
     postprocess: PostprocessConfig,
     rate: RateControl,
+    /// True if the pose source takes the levels of this detector.
+    shares_encoder: bool,
+    /// The current sweep, if it was encoded before its pose was estimated.
+    encoded: Option<Encoded>,
+    /// Levels of the current sweep, for a measurement after it was perceived.
+    levels: Option<Vec<BackboneLevel>>,
 }
 
 impl Agent {
@@ -69,7 +75,17 @@ impl Agent {
     #[must_use]
     pub fn new(cav: CavId, pose_source: Box<dyn PoseSource>, detector: Detector) -> Self {
         let postprocess = PostprocessConfig::for_late_fusion(detector.config());
-        Self { cav, pose_source, detector, postprocess, rate: RateControl::default() }
+        let shares_encoder = pose_source.detector_encoder() == Some(detector.encoder_sha256());
+        Self {
+            cav,
+            pose_source,
+            detector,
+            postprocess,
+            rate: RateControl::default(),
+            shares_encoder,
+            encoded: None,
+            levels: None,
+        }
     }
 
     /// The same with feature maps that keep within `rate`, applied by [`Self::write_map`].
@@ -96,15 +112,27 @@ impl Agent {
         &self.detector
     }
 
+    /// Step before the first: encodes the sweep if the pose is estimated from the detector's levels, so that it is
+    /// encoded once. Without it the pose source encodes the sweep itself, with the same result.
+    pub fn prepare(&mut self, cloud: &PointCloud) {
+        let is_needed = self.shares_encoder && self.pose_source.computes_from_sweep();
+        // An error comes again, and is returned, when the sweep is perceived.
+        self.encoded = is_needed.then(|| self.detector.encode(cloud).ok()).flatten();
+    }
+
     /// First step: the pose, which goes out before anything else is computed.
     pub fn estimate_pose(&mut self, input: &AgentInput<'_>) -> PoseEstimate {
-        self.pose_source.estimate(&pose_input(&self.cav, input))
+        self.levels = None;
+        let levels = self.encoded.as_ref().map(|encoded| encoded.levels.as_slice());
+        self.pose_source.estimate(&pose_input(&self.cav, input, levels))
     }
 
     /// Last step, after everything of the sweep was published: measures for the poses of later sweeps. True if the
     /// sweep was measured.
     pub fn observe(&mut self, input: &AgentInput<'_>) -> bool {
-        self.pose_source.observe(&pose_input(&self.cav, input))
+        self.encoded = None;
+        let levels = self.levels.take();
+        self.pose_source.observe(&pose_input(&self.cav, input, levels.as_deref()))
     }
 
     /// Last step if there is no queue: the feature map as `codec` specifies, or smaller if a limit requires it. A live
@@ -136,12 +164,14 @@ impl Agent {
 
     /// Second step: feature map, confidence and own detections.
     ///
+    /// # Errors
     /// [`DetectorError`] if the tensor library fails.
-    /// [`DetectorError`] when the tensor library refuses.
     pub fn perceive(&mut self, cloud: &PointCloud) -> Result<Perception, DetectorError> {
-        let encoded = self.detector.encode(cloud)?;
-        let perception = self.perceive_map(&encoded.features)?;
-        Ok(Perception { times: [encoded.times, perception.times].concat(), ..perception })
+        let encoded = self.encoded.take().map_or_else(|| self.detector.encode(cloud), Ok)?;
+        let Encoded { features, levels, times, .. } = encoded;
+        let perception = self.perceive_map(&features)?;
+        self.levels = self.shares_encoder.then_some(levels);
+        Ok(Perception { times: [times, perception.times].concat(), ..perception })
     }
 
     /// The same from a feature map `[1, C, H, W]` that the encoder computed before, as the encoder returned it.
@@ -168,6 +198,7 @@ impl Agent {
     /// # Errors
     /// See [`Self::perceive`].
     pub fn process(&mut self, input: &AgentInput<'_>) -> Result<AgentOutput, DetectorError> {
+        self.prepare(input.cloud);
         let began = Instant::now();
         let pose = self.estimate_pose(input);
         let pose_time = began.elapsed();
@@ -177,27 +208,30 @@ impl Agent {
     }
 }
 
-fn pose_input<'a>(cav: &'a CavId, input: &AgentInput<'a>) -> PoseInput<'a> {
+fn pose_input<'a>(cav: &'a CavId, input: &AgentInput<'a>, levels: Option<&'a [BackboneLevel]>) -> PoseInput<'a> {
     let AgentInput { capture_nanos, cloud, measured_pose: measured, motion } = *input;
-    PoseInput { cav, capture_nanos, cloud, measured, motion }
+    PoseInput { cav, capture_nanos, cloud, levels, measured, motion }
 }
 
 #[cfg(test)]
 mod tests {
+    use std::sync::{Arc, Mutex};
+
     use protocol::DecodedFeatures;
     use tch::Device;
     use tch::nn::VarStore;
 
     use super::*;
-    use localization::pose_source::RecordedPose;
+    use localization::pose_source::{NO_SOURCE, RecordedPose};
     use perception::model_config::DetectorConfig;
     use perception::pillars::point_pillars::PointPillars;
+    use perception::weights::{CONFIG_KEY, Precision, save};
 
     fn agent() -> Agent {
         agent_with(None)
     }
 
-    fn agent_with(compress_ratio: Option<i64>) -> Agent {
+    fn small_network(compress_ratio: Option<i64>) -> (VarStore, DetectorConfig, PointPillars) {
         tch::set_num_threads(1);
         tch::manual_seed(11);
         let lidar_range_m = [-12.8, -6.4, -3.0, 12.8, 6.4, 1.0];
@@ -206,6 +240,11 @@ mod tests {
         let pillars = PointPillars::new(&network.root(), &config).unwrap();
         // A head with vehicles everywhere gives non-maximum suppression something to do.
         let _ = tch::no_grad(|| network.variables()["cls_head.bias"].shallow_clone().fill_(0.5));
+        (network, config, pillars)
+    }
+
+    fn agent_with(compress_ratio: Option<i64>) -> Agent {
+        let (_network, _, pillars) = small_network(compress_ratio);
         Agent::new(CavId::new("4279").unwrap(), Box::new(RecordedPose), Detector::from_network(pillars))
     }
 
@@ -230,6 +269,63 @@ mod tests {
         assert_eq!(stages, ["voxelise", "pillars", "backbone", "message", "head", "boxes"]);
         let second = agent.process(&input).unwrap();
         assert_eq!((second.perception.features, second.perception.detections), (features.clone(), detections.clone()));
+    }
+
+    /// A pose source that takes levels, and notes the steps in which it gets them.
+    #[derive(Debug)]
+    struct TakesLevels {
+        encoder: String,
+        computes_first: bool,
+        given: Arc<Mutex<Vec<bool>>>,
+    }
+
+    impl PoseSource for TakesLevels {
+        fn estimate(&mut self, input: &PoseInput<'_>) -> PoseEstimate {
+            self.given.lock().unwrap().push(input.levels.is_some());
+            NO_SOURCE
+        }
+
+        fn observe(&mut self, input: &PoseInput<'_>) -> bool {
+            self.given.lock().unwrap().push(input.levels.is_some());
+            true
+        }
+
+        fn detector_encoder(&self) -> Option<&str> {
+            Some(&self.encoder)
+        }
+
+        fn computes_from_sweep(&self) -> bool {
+            self.computes_first
+        }
+    }
+
+    #[test]
+    fn a_pose_source_gets_the_levels_of_its_own_encoder_as_soon_as_it_computes() {
+        let folder = tempfile::tempdir().unwrap();
+        let weights = folder.path().join("detector.safetensors");
+        let (network, config, _) = small_network(None);
+        let metadata = [(CONFIG_KEY.to_owned(), serde_json::to_string(&config).unwrap())].into();
+        save(&weights, &network, &metadata, Precision::Single).unwrap();
+        let cloud = PointCloud { xyzi: (0..500).map(|k| [(k % 83) as f32 * 0.1 + 3.0, 0.5, -1.5, 0.2]).collect() };
+        let input = AgentInput { capture_nanos: 0, cloud: &cloud, measured_pose: None, motion: EgoMotion::default() };
+        let load = || Detector::load(&weights, Device::Cpu).unwrap();
+        let mut plain = Agent::new(CavId::new("7").unwrap(), Box::new(RecordedPose), load());
+        let expected = plain.perceive(&cloud).unwrap();
+        let stages = |times: &[StageTiming]| times.iter().map(|timing| timing.stage.clone()).collect::<Vec<_>>();
+        for (is_own, computes_first, steps) in
+            [(true, true, [true, true]), (true, false, [false, true]), (false, true, [false, false])]
+        {
+            let detector = load();
+            let encoder = if is_own { detector.encoder_sha256().to_owned() } else { "other".to_owned() };
+            let given = Arc::<Mutex<Vec<bool>>>::default();
+            let source = TakesLevels { encoder, computes_first, given: Arc::clone(&given) };
+            let mut agent = Agent::new(CavId::new("7").unwrap(), Box::new(source), detector);
+            let seen = agent.process(&input).unwrap().perception;
+            assert_eq!((&seen.features, stages(&seen.times)), (&expected.features, stages(&expected.times)));
+            // Levels are those of one sweep.
+            agent.observe(&input);
+            assert_eq!(*given.lock().unwrap(), [steps.as_slice(), &[false]].concat());
+        }
     }
 
     #[test]

@@ -269,8 +269,10 @@ impl<'a> Node<'a> {
     fn process(&mut self, input: &AgentInput<'_>) {
         let stats = self.bus.stats();
         let began = Instant::now();
+        self.agent.prepare(input.cloud);
+        let pose_began = Instant::now();
         let pose = self.filter.pose(self.agent.estimate_pose(input));
-        stats.timed("pose", began.elapsed());
+        stats.timed("pose", pose_began.elapsed());
         self.publishers.pose.submit(input.capture_nanos, pose);
         self.time_pose_stages();
         self.report.no_pose += u64::from(pose.world_from_cav().is_none());

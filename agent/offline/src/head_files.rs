@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-use localization::pgc::{SceneHead, SceneHeadConfig};
+use localization::pgc::{CellEncoder, SceneHead, SceneHeadConfig};
 use perception::weights::{Weights, WeightsError};
 use support::shared_files;
 
@@ -67,25 +67,33 @@ pub fn head_file(head: &str) -> Result<PathBuf, HeadFileError> {
         .ok_or_else(|| HeadFileError::NoHead { head: head.to_owned(), released: released() })
 }
 
-/// The encoder of a head: `pgc-encoder.safetensors` beside it, or the released one whose digest its metadata names.
+/// The encoder of a head, scene encoder or detector: the file whose digest its metadata names, of those beside it or
+/// released; without one `pgc-encoder.safetensors` beside it.
 ///
 /// # Errors
 /// [`HeadFileError`] when there is none, or the head cannot be read.
 pub fn encoder_of(head: &Path) -> Result<PathBuf, HeadFileError> {
-    let beside = head.with_file_name(ENCODER_FILE);
-    if beside.is_file() {
-        return Ok(beside);
+    let beside = Some(head.with_file_name(ENCODER_FILE)).filter(|file| file.is_file());
+    match (named_encoder(head), beside) {
+        (Ok(Ok(found)), _) => Ok(found),
+        // The digests are compared, and an unreadable head is reported, when both are opened.
+        (_, Some(beside)) => Ok(beside),
+        (Ok(Err(sha256)), None) => Err(HeadFileError::NoEncoder { head: head.to_owned(), sha256 }),
+        (Err(error), None) => Err(error),
     }
+}
+
+/// The encoder that a head names, or its digest if no file has it.
+fn named_encoder(head: &Path) -> Result<Result<PathBuf, String>, HeadFileError> {
     let weights = Weights::load(head)?;
     weights.check_kind(SceneHead::KIND)?;
     let sha256 = weights.config::<SceneHeadConfig>()?.encoder_sha256;
     let folders = head.parent().map(Path::to_owned).into_iter().chain(weights_folders());
-    let encoders = folders
-        .flat_map(|folder| files_in(&folder))
-        .filter(|file| file.file_stem().and_then(|stem| stem.to_str()).is_some_and(|stem| stem.contains("encoder")));
-    let is_named = |file: &PathBuf| Weights::load(file).is_ok_and(|weights| weights.sha256() == sha256);
-    let mut encoders = encoders.filter(is_named);
-    encoders.next().ok_or_else(|| HeadFileError::NoEncoder { head: head.to_owned(), sha256: sha256.clone() })
+    let files = folders.flat_map(|folder| files_in(&folder)).filter(|file| file != head);
+    let (encoders, others): (Vec<PathBuf>, Vec<PathBuf>) = files
+        .partition(|file| file.file_stem().and_then(|stem| stem.to_str()).is_some_and(|stem| stem.contains("encoder")));
+    let is_named = |file: &PathBuf| Weights::load(file).is_ok_and(|weights| CellEncoder::sha256_of(&weights) == sha256);
+    Ok(encoders.into_iter().chain(others).find(is_named).ok_or(sha256))
 }
 
 /// The released encoder, for a new head.

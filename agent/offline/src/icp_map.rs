@@ -121,6 +121,7 @@ mod tests {
             cav: &cav,
             capture_nanos: 0,
             cloud: &cloud,
+            levels: None,
             measured: Some(&measured),
             motion: protocol::EgoMotion::default(),
         };

@@ -8,7 +8,7 @@ use dataset::frame::{Frame, Object, ObjectClass};
 use dataset::ground_truth::{self, GroundTruthRule};
 use dataset::pcd;
 use dataset::{self, Dataset, Layout, LoadOptions, OpenOptions};
-use localization::pgc::Localizer;
+use localization::pgc::{Localizer, LocalizerInput};
 use perception::inference::Inference;
 use sim_replay::inspect::{TickReport, inspect};
 use tests::fixtures::data;
@@ -249,7 +249,7 @@ fn a_real_sweep_passes_through_the_shipped_networks_and_is_placed_nowhere() {
     let [encoder, head] = ["pgc-encoder", "pgc-town1"].map(|name| weights.join(format!("{name}.safetensors")));
     let localizer = Localizer::load(&encoder, &head, Inference::default()).unwrap();
     let frame = dataset.scenarios[0].load(0, 0, &LoadOptions::default()).unwrap();
-    let (coordinates, _) = localizer.scene_coordinates(&frame.points).unwrap();
+    let (coordinates, _) = localizer.scene_coordinates(LocalizerInput::of(&frame.points)).unwrap();
     assert!(coordinates.sensor_m.len() > 100, "{} cells", coordinates.sensor_m.len());
     assert!(coordinates.world_m.iter().flatten().chain(&coordinates.epsilon_m).all(|number| number.is_finite()));
     // Recorded in another town than that of the head.

@@ -3,10 +3,8 @@
 
 use std::time::Instant;
 
-use protocol::PointCloud;
-
 use crate::pgc::pose_solver::PoseSolver;
-use crate::pgc::{Localization, Localize, Localizer, LocalizerError};
+use crate::pgc::{Localization, Localize, Localizer, LocalizerError, LocalizerInput};
 
 /// The localizer's networks, whose coordinates go through a solver with equal weights.
 ///
@@ -27,12 +25,16 @@ impl LightLoc {
 }
 
 impl Localize for LightLoc {
-    fn localize(&mut self, cloud: &PointCloud) -> Result<Localization, LocalizerError> {
-        let (mut coordinates, mut times) = self.localizer.scene_coordinates(cloud)?;
+    fn localize_sweep(&mut self, sweep: LocalizerInput<'_>) -> Result<Localization, LocalizerError> {
+        let (mut coordinates, mut times) = self.localizer.scene_coordinates(sweep)?;
         coordinates.epsilon_m.fill(0.0);
         let start = Instant::now();
         let solved = self.solver.solve(&coordinates);
         times.solve = start.elapsed();
         Ok(Localization::new(&solved, times))
+    }
+
+    fn detector_encoder(&self) -> Option<&str> {
+        self.localizer.detector_encoder()
     }
 }

@@ -5,9 +5,9 @@
 use std::time::Instant;
 
 use nalgebra::Isometry3;
-use protocol::{NoPoseReason, PointCloud, PoseEstimate};
+use protocol::{NoPoseReason, PoseEstimate};
 
-use crate::pgc::{Localization, Localize, Localizer, LocalizerError, LocalizerTimes};
+use crate::pgc::{Localization, Localize, Localizer, LocalizerError, LocalizerInput, LocalizerTimes};
 
 /// Smallest deviation of a channel: constant ones are scaled as if they had this one.
 const LEAST_DEVIATION: f32 = 1e-4;
@@ -84,7 +84,8 @@ impl Retrieval {
 
 impl Localize for Retrieval {
     /// Every pose has full confidence: nothing tells a good one from a bad one.
-    fn localize(&mut self, cloud: &PointCloud) -> Result<Localization, LocalizerError> {
+    fn localize_sweep(&mut self, sweep: LocalizerInput<'_>) -> Result<Localization, LocalizerError> {
+        let cloud = sweep.cloud;
         let mut times = LocalizerTimes::default();
         let Some(descriptor) = self.localizer.sweep_features(cloud, &mut times)? else {
             let none = PoseEstimate::NoPose { reason: NoPoseReason::TooFewPoints, inlier_count: 0 };

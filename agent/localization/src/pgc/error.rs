@@ -2,6 +2,7 @@
 
 use tch::TchError;
 
+use perception::detector::DetectorError;
 use perception::torch_error::first_line;
 use perception::weights::WeightsError;
 
@@ -34,6 +35,9 @@ pub enum LocalizerError {
         /// SHA-256 of this encoder.
         found: String,
     },
+    /// The detector whose encoder is used failed.
+    #[error(transparent)]
+    Detector(#[from] DetectorError),
     /// The tensor library failed.
     #[error("tensor library: {}", first_line(.0))]
     Tensor(#[from] TchError),

@@ -16,7 +16,7 @@ pub struct SceneHeadConfig {
     /// Name of the scene, in model cards and messages.
     #[serde(rename = "town")]
     pub scene_name: String,
-    /// SHA-256 of the encoder file whose features it was trained on.
+    /// SHA-256 of the encoder whose features it was trained on: of its file, or of the encoder inside a detector's.
     pub encoder_sha256: String,
     /// Channels of a cell.
     pub cell_channels: i64,

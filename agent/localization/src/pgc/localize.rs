@@ -8,6 +8,7 @@ use protocol::{PointCloud, PoseEstimate, StageTiming};
 use tch::nn::VarStore;
 use tch::{Device, Kind, TchError, Tensor, no_grad};
 
+use super::cell_encoder::{CellEncoder, PreparedSweep};
 use super::confidence::{CONFIDENCE_KEY, Confidence, ConfidenceModel};
 use super::error::LocalizerError;
 use super::head_config::SceneHeadConfig;
@@ -17,11 +18,11 @@ use super::pose_refinement::{self, SweepCells};
 use super::pose_search::{PoseSearch, SearchTimes};
 use super::pose_solver::{self, FoundPose, PoseSolver, Solved};
 use super::pose_std::PoseStd;
-use super::scene_encoder::{SceneEncoder, SceneFeatures};
+use super::scene_encoder::SceneFeatures;
 use super::scene_regression::SceneHead;
-use super::voxel_batch::VoxelBatch;
-use super::voxelise::{Cell, SweepVoxels};
+use super::voxelise::Cell;
 use crate::registration::Correspondence;
+use perception::detector::BackboneLevel;
 use perception::inference::Inference;
 use perception::int8::ScaleSearch;
 use perception::weights::Weights;
@@ -49,7 +50,7 @@ pub struct SceneCoordinates {
 
 /// A sweep behind the encoder.
 struct EncodedSweep {
-    sweep: SweepVoxels,
+    sweep: PreparedSweep,
     features: SceneFeatures,
     /// Cells of the pose refinement.
     refinement_cells: SweepCells,
@@ -85,6 +86,24 @@ pub struct Localization {
     pub times: LocalizerTimes,
 }
 
+/// Input of a localizer: one sweep.
+#[derive(Debug, Clone, Copy)]
+pub struct LocalizerInput<'a> {
+    /// The sweep, in the LiDAR frame.
+    pub cloud: &'a PointCloud,
+    /// Levels of the backbone of the vehicle's detector for it, if they are computed already and are those of
+    /// [`Localize::detector_encoder`].
+    pub levels: Option<&'a [BackboneLevel]>,
+}
+
+impl<'a> LocalizerInput<'a> {
+    /// A sweep of which nothing is computed yet.
+    #[must_use]
+    pub fn of(cloud: &'a PointCloud) -> Self {
+        Self { cloud, levels: None }
+    }
+}
+
 /// Estimates the pose of a sweep.
 pub trait Localize: std::fmt::Debug + Send {
     /// Localizes one sweep.
@@ -92,27 +111,40 @@ pub trait Localize: std::fmt::Debug + Send {
     /// # Errors
     /// [`LocalizerError::Tensor`] when the tensor library fails. A sweep that cannot be localized is no error but a
     /// result: [`PoseEstimate::NoPose`].
-    fn localize(&mut self, cloud: &PointCloud) -> Result<Localization, LocalizerError>;
+    fn localize_sweep(&mut self, sweep: LocalizerInput<'_>) -> Result<Localization, LocalizerError>;
+
+    /// Localizes one sweep of which nothing is computed yet.
+    ///
+    /// # Errors
+    /// As [`Self::localize_sweep`].
+    fn localize(&mut self, cloud: &PointCloud) -> Result<Localization, LocalizerError> {
+        self.localize_sweep(LocalizerInput::of(cloud))
+    }
+
+    /// SHA-256 of the encoder of the detector whose levels it takes; `None` if it has an encoder of its own.
+    fn detector_encoder(&self) -> Option<&str> {
+        None
+    }
 
     /// Localizes one sweep near a predicted pose `world_from_sensor`, which saves time if the sweep confirms it. By
     /// default the prediction is not used.
     ///
     /// # Errors
-    /// As [`Self::localize`].
+    /// As [`Self::localize_sweep`].
     fn localize_near(
         &mut self,
-        cloud: &PointCloud,
+        sweep: LocalizerInput<'_>,
         world_from_sensor: &Isometry3<f64>,
     ) -> Result<Localization, LocalizerError> {
         let _ = world_from_sensor;
-        self.localize(cloud)
+        self.localize_sweep(sweep)
     }
 }
 
 /// Encoder, scene-specific head and solver.
 #[derive(Debug)]
 pub struct Localizer {
-    encoder: SceneEncoder,
+    encoder: CellEncoder,
     head: SceneHead,
     solver: PoseSolver,
     device: Device,
@@ -142,7 +174,7 @@ impl Localizer {
 
     fn open(encoder: &Path, head: &Path, inference: Inference) -> Result<(Self, Weights), LocalizerError> {
         let Inference { device, precision } = inference;
-        let (mut network, encoder_sha256) = SceneEncoder::load(encoder, device)?;
+        let (mut network, encoder_sha256) = CellEncoder::load(encoder, inference)?;
         let weights = Weights::load(head)?.with_precision(precision);
         weights.check_kind(SceneHead::KIND)?;
         let config: SceneHeadConfig = weights.config()?;
@@ -172,9 +204,10 @@ impl Localizer {
     /// [`LocalizerError::Tensor`] when the tensor library fails.
     pub fn observe(&self, cloud: &PointCloud, search: &mut ScaleSearch) -> Result<(), LocalizerError> {
         let mut times = LocalizerTimes::default();
-        let Some(EncodedSweep { sweep, features, .. }) = self.encode(cloud, &mut times)? else { return Ok(()) };
-        let batch = VoxelBatch::new(&[&sweep], self.encoder.config(), self.device)?;
-        self.encoder.observe(&batch, search)?;
+        let Some(EncodedSweep { sweep, features, .. }) = self.encode(LocalizerInput::of(cloud), &mut times)? else {
+            return Ok(());
+        };
+        self.encoder.observe(&sweep, search)?;
         let chosen = choose_evenly(sweep.cells(), self.head.config().max_cells.min(CELLS));
         let cells = self.pick(&sweep, &features, &chosen)?.features;
         no_grad(|| {
@@ -200,9 +233,12 @@ impl Localizer {
     ///
     /// # Errors
     /// [`LocalizerError::Tensor`] when the tensor library fails.
-    pub fn scene_coordinates(&self, cloud: &PointCloud) -> Result<(SceneCoordinates, LocalizerTimes), LocalizerError> {
+    pub fn scene_coordinates(
+        &self,
+        sweep: LocalizerInput<'_>,
+    ) -> Result<(SceneCoordinates, LocalizerTimes), LocalizerError> {
         let mut times = LocalizerTimes::default();
-        let coordinates = match self.encode(cloud, &mut times)? {
+        let coordinates = match self.encode(sweep, &mut times)? {
             Some(encoded) => self.regress(&encoded, CELLS, &mut times)?,
             None => SceneCoordinates::default(),
         };
@@ -218,23 +254,25 @@ impl Localizer {
         cloud: &PointCloud,
         times: &mut LocalizerTimes,
     ) -> Result<Option<Vec<f32>>, LocalizerError> {
-        let Some(encoded) = self.encode(cloud, times)? else { return Ok(None) };
+        let Some(encoded) = self.encode(LocalizerInput::of(cloud), times)? else { return Ok(None) };
         Ok(Some(Vec::try_from(&encoded.features.sweeps.f_reshape([-1])?.f_to_device(Device::Cpu)?)?))
     }
 
     /// Cells and features; `None` for a sweep without cells.
-    fn encode(&self, cloud: &PointCloud, times: &mut LocalizerTimes) -> Result<Option<EncodedSweep>, LocalizerError> {
+    fn encode(
+        &self,
+        input: LocalizerInput<'_>,
+        times: &mut LocalizerTimes,
+    ) -> Result<Option<EncodedSweep>, LocalizerError> {
         let start = Instant::now();
-        let points = cloud.xyzi.iter().map(|&[x, y, z, _]| [x, y, z]);
-        let sweep = SweepVoxels::new(points, self.encoder.config());
+        let sweep = self.encoder.format().prepare(&input.cloud.xyzi);
         times.voxelise = start.elapsed();
         let refined = choose_evenly(sweep.cells(), REFINEMENT_CELLS);
         if refined.is_empty() {
             return Ok(None);
         }
         let start = Instant::now();
-        let batch = VoxelBatch::new(&[&sweep], self.encoder.config(), self.device)?;
-        let features = self.encoder.encode(&batch, Kind::Float)?;
+        let features = self.encoder.encode_one(&sweep, input.levels)?;
         let refinement_cells = self.pick(&sweep, &features, &refined)?;
         times.encode = start.elapsed();
         Ok(Some(EncodedSweep { sweep, features, refinement_cells }))
@@ -292,7 +330,7 @@ impl Localizer {
         Ok(refined.and_then(|refined| pose_solver::confirm(&refined, &origin_from_sensor, &origin_m)))
     }
 
-    fn pick(&self, sweep: &SweepVoxels, features: &SceneFeatures, chosen: &[usize]) -> Result<SweepCells, TchError> {
+    fn pick(&self, sweep: &PreparedSweep, features: &SceneFeatures, chosen: &[usize]) -> Result<SweepCells, TchError> {
         let rows: Vec<i64> = chosen.iter().map(|&cell| cell as i64).collect();
         let rows = Tensor::f_from_slice(&rows)?.f_to_device(self.device)?;
         let features = no_grad(|| features.cells.f_index_select(0, &rows))?;
@@ -316,44 +354,40 @@ impl Localizer {
     /// [`LocalizerError::Tensor`] when the tensor library fails. A sweep that cannot be localized is no error but a
     /// result: [`PoseEstimate::NoPose`].
     pub fn localize(&self, cloud: &PointCloud) -> Result<Localization, LocalizerError> {
+        self.localize_globally(LocalizerInput::of(cloud))
+    }
+
+    fn localize_globally(&self, sweep: LocalizerInput<'_>) -> Result<Localization, LocalizerError> {
         let mut times = LocalizerTimes::default();
-        match self.encode(cloud, &mut times)? {
+        match self.encode(sweep, &mut times)? {
             Some(encoded) => self.search(&encoded, times),
             None => Ok(Localization::new(&self.solver.solve(&SceneCoordinates::default()), times)),
         }
     }
+}
 
-    /// The same with a predicted pose: if the sweep confirms it, few scene coordinates and no search are needed.
-    ///
-    /// # Errors
-    /// As [`Self::localize`].
-    pub fn localize_near(
-        &self,
-        cloud: &PointCloud,
+impl Localize for Localizer {
+    fn localize_sweep(&mut self, sweep: LocalizerInput<'_>) -> Result<Localization, LocalizerError> {
+        self.localize_globally(sweep)
+    }
+
+    fn detector_encoder(&self) -> Option<&str> {
+        self.encoder.takes_levels().then_some(self.sha256[0].as_str())
+    }
+
+    fn localize_near(
+        &mut self,
+        sweep: LocalizerInput<'_>,
         world_from_sensor: &Isometry3<f64>,
     ) -> Result<Localization, LocalizerError> {
         let mut times = LocalizerTimes::default();
-        let Some(encoded) = self.encode(cloud, &mut times)? else {
+        let Some(encoded) = self.encode(sweep, &mut times)? else {
             return Ok(Localization::new(&self.solver.solve(&SceneCoordinates::default()), times));
         };
         match self.refine(&encoded, world_from_sensor, &mut times)? {
             Some(found) => Ok(Localization::new(&Ok(found), times)),
             None => self.search(&encoded, times),
         }
-    }
-}
-
-impl Localize for Localizer {
-    fn localize(&mut self, cloud: &PointCloud) -> Result<Localization, LocalizerError> {
-        Self::localize(self, cloud)
-    }
-
-    fn localize_near(
-        &mut self,
-        cloud: &PointCloud,
-        world_from_sensor: &Isometry3<f64>,
-    ) -> Result<Localization, LocalizerError> {
-        Self::localize_near(self, cloud, world_from_sensor)
     }
 }
 

@@ -3,6 +3,7 @@
 //! A sparse encoder describes the cells of the sweep; a scene-specific head predicts the world coordinates of each cell
 //! and their error; a robust solver turns these correspondences into a pose.
 
+pub mod cell_encoder;
 pub mod confidence;
 pub(crate) mod dense;
 pub(crate) mod encoder_config;
@@ -27,10 +28,11 @@ pub(crate) mod voxel_batch;
 pub(crate) mod voxelise;
 pub mod wrong_place;
 
+pub use cell_encoder::{CellEncoder, EncodedCells, PreparedSweep, SweepFormat};
 pub use encoder_config::{SceneEncoderConfig, VoxelInput};
 pub use error::LocalizerError;
 pub use head_config::{RefinerConfig, SceneHeadConfig};
-pub use localize::{Localization, Localize, Localizer, LocalizerTimes, SceneCoordinates, sigma};
+pub use localize::{Localization, Localize, Localizer, LocalizerInput, LocalizerTimes, SceneCoordinates, sigma};
 pub use pose_evidence::{PoseEvidence, RefinementEvidence};
 pub use refinement_network::Refiner;
 pub use scene_encoder::{LocalFeatures, SceneEncoder, SceneFeatures};

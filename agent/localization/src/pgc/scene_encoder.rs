@@ -75,13 +75,21 @@ impl SceneEncoder {
     /// [`LocalizerError`] when the file is missing, truncated or of another kind.
     pub fn load(path: &Path, device: Device) -> Result<(Self, String), LocalizerError> {
         let weights = Weights::load(path)?;
+        Ok((Self::from_weights(&weights, device)?, weights.sha256().to_owned()))
+    }
+
+    /// The encoder of a file already read, frozen.
+    ///
+    /// # Errors
+    /// As [`Self::load`].
+    pub(super) fn from_weights(weights: &Weights, device: Device) -> Result<Self, LocalizerError> {
         weights.check_kind(Self::KIND)?;
         let config: SceneEncoderConfig = weights.config()?;
         let mut network = VarStore::new(device);
         let encoder = Self::new(&network.root(), &config)?;
         weights.copy_into(&network)?;
         network.freeze();
-        Ok((encoder, weights.sha256().to_owned()))
+        Ok(encoder)
     }
 
     /// Configuration that it was built from.

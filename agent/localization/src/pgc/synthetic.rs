@@ -1,13 +1,12 @@
 //! Synthetic scene coordinates: cells with drawn errors, without a network, for tests and benches.
 
 use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
-use protocol::PointCloud;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, Normal};
 
 use super::error::LocalizerError;
-use super::localize::{Localization, Localize, LocalizerTimes, SceneCoordinates};
+use super::localize::{Localization, Localize, LocalizerInput, LocalizerTimes, SceneCoordinates};
 use super::pose_solver::PoseSolver;
 
 /// Origin of the scene in the world: far away, as in maps in UTM coordinates, metres.
@@ -72,7 +71,7 @@ impl SyntheticScene {
 }
 
 impl Localize for SyntheticScene {
-    fn localize(&mut self, _: &PointCloud) -> Result<Localization, LocalizerError> {
+    fn localize_sweep(&mut self, _: LocalizerInput<'_>) -> Result<Localization, LocalizerError> {
         self.next_seed += 1;
         let solved = PoseSolver::default().solve(&self.coordinates(self.next_seed - 1));
         Ok(Localization::new(&solved, LocalizerTimes::default()))

@@ -17,7 +17,7 @@ use crate::pgc::{Localize, Localizer, LocalizerError};
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema, clap::Args)]
 #[serde(deny_unknown_fields)]
 pub struct PgcConfig {
-    /// Weights of the localizer's scene encoder (pose source pgc).
+    /// Weights of the encoder: the scene encoder, or a detector whose backbone serves both (pose source pgc).
     #[arg(long, value_name = "FILE")]
     pub encoder: PathBuf,
     /// Weights of the scene-specific head (pose source pgc).
@@ -88,7 +88,7 @@ impl PoseSource for LocalizedPose {
     /// Ignores the measured pose.
     fn estimate(&mut self, input: &PoseInput<'_>) -> PoseEstimate {
         self.times.clear();
-        let estimate = match self.localizer.localize(input.cloud) {
+        let estimate = match self.localizer.localize_sweep(input.sweep()) {
             Ok(localization) => {
                 self.times = localization.times.stages();
                 localization.estimate
@@ -107,6 +107,14 @@ impl PoseSource for LocalizedPose {
         }
     }
 
+    fn detector_encoder(&self) -> Option<&str> {
+        self.localizer.detector_encoder()
+    }
+
+    fn computes_from_sweep(&self) -> bool {
+        true
+    }
+
     fn stages(&self) -> &[StageTiming] {
         &self.times
     }
@@ -122,7 +130,7 @@ mod tests {
 
     use super::*;
     use crate::pgc::synthetic::SyntheticScene;
-    use crate::pgc::{Localization, LocalizerTimes};
+    use crate::pgc::{Localization, LocalizerInput, LocalizerTimes};
 
     fn estimates(source: &mut LocalizedPose, count: u64) -> Vec<PoseEstimate> {
         let cav = CavId::new("7").unwrap();
@@ -133,6 +141,7 @@ mod tests {
             cav: &cav,
             capture_nanos: step * 100_000_000,
             cloud: &cloud,
+            levels: None,
             measured: Some(&measured),
             motion: EgoMotion::default(),
         };
@@ -158,7 +167,7 @@ mod tests {
     struct Broken;
 
     impl Localize for Broken {
-        fn localize(&mut self, _: &PointCloud) -> Result<Localization, LocalizerError> {
+        fn localize_sweep(&mut self, _: LocalizerInput<'_>) -> Result<Localization, LocalizerError> {
             Err(LocalizerError::Config("broken".into()))
         }
     }

@@ -15,6 +15,7 @@ mod tracked;
 
 use std::path::{Path, PathBuf};
 
+use perception::detector::BackboneLevel;
 use perception::inference::Inference;
 use protocol::config::{FieldError, within};
 use protocol::{CavId, EgoMotion, NoPoseReason, PointCloud, Pose, PoseEstimate, StageTiming};
@@ -29,7 +30,7 @@ pub(crate) use pose_table::CachedPose;
 pub use pose_table::{CachedPoseConfig, PoseRow, PoseTable, PoseTableError};
 pub use tracked::{TrackedPose, TrackedPoseConfig};
 
-use crate::pgc::LocalizerError;
+use crate::pgc::{LocalizerError, LocalizerInput};
 
 /// Inputs of a source for one sweep.
 #[derive(Debug, Clone, Copy)]
@@ -40,10 +41,21 @@ pub struct PoseInput<'a> {
     pub capture_nanos: u64,
     /// The sweep, in the LiDAR frame.
     pub cloud: &'a PointCloud,
+    /// Levels of the backbone of the vehicle's detector for it, if they are computed already and are those of
+    /// [`PoseSource::detector_encoder`].
+    pub levels: Option<&'a [BackboneLevel]>,
     /// `world_from_lidar` as recorded, or as a receiver measured it.
     pub measured: Option<&'a Pose>,
     /// Speed and yaw rate of the vehicle at that time, where its sensors measure them.
     pub motion: EgoMotion,
+}
+
+impl<'a> PoseInput<'a> {
+    /// Input of a localizer.
+    #[must_use]
+    pub(crate) fn sweep(&self) -> LocalizerInput<'a> {
+        LocalizerInput { cloud: self.cloud, levels: self.levels }
+    }
 }
 
 /// Source of an agent's pose.
@@ -55,6 +67,16 @@ pub trait PoseSource: std::fmt::Debug + Send {
     /// the sweep was measured.
     fn observe(&mut self, input: &PoseInput<'_>) -> bool {
         let _ = input;
+        false
+    }
+
+    /// SHA-256 of the encoder of the detector whose levels it takes instead of encoding sweeps itself.
+    fn detector_encoder(&self) -> Option<&str> {
+        None
+    }
+
+    /// True if the next [`Self::estimate`] computes from the sweep, so that it can use levels.
+    fn computes_from_sweep(&self) -> bool {
         false
     }
 
@@ -344,6 +366,7 @@ mod tests {
             cav: &cav,
             capture_nanos: 5,
             cloud: &cloud,
+            levels: None,
             measured: Some(&pose),
             motion: EgoMotion::default(),
         };

@@ -274,6 +274,7 @@ mod tests {
                 cav,
                 capture_nanos,
                 cloud: &cloud,
+                levels: None,
                 measured: Some(&Pose::IDENTITY),
                 motion: protocol::EgoMotion::default(),
             })

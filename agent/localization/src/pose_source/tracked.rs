@@ -19,7 +19,7 @@ use crate::tracker::{Correction, PoseMeasurement, PoseTracker, TrackedState, Tra
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema, clap::Args)]
 #[serde(deny_unknown_fields)]
 pub struct TrackedPoseConfig {
-    /// Weights of the localizer's scene encoder.
+    /// Weights of the encoder: the scene encoder, or a detector whose backbone serves both.
     #[arg(skip)]
     #[serde(default)]
     pub encoder: PathBuf,
@@ -140,10 +140,10 @@ impl TrackedPose {
     fn measure(&mut self, input: &PoseInput<'_>, predicted: Option<&TrackedState>) -> Option<Localization> {
         self.measured_nanos = Some(input.capture_nanos);
         let measured = match predicted {
-            Some(state) => self.localizer.localize_near(input.cloud, &state.world_from_lidar),
+            Some(state) => self.localizer.localize_near(input.sweep(), &state.world_from_lidar),
             None => {
                 self.global_nanos = Some(input.capture_nanos);
-                self.localizer.localize(input.cloud)
+                self.localizer.localize_sweep(input.sweep())
             }
         };
         match measured {
@@ -218,6 +218,15 @@ impl PoseSource for TrackedPose {
         true
     }
 
+    fn detector_encoder(&self) -> Option<&str> {
+        self.localizer.detector_encoder()
+    }
+
+    /// A vehicle that is lost is localized first.
+    fn computes_from_sweep(&self) -> bool {
+        self.tracker.state().is_none()
+    }
+
     fn stages(&self) -> &[StageTiming] {
         &self.times
     }
@@ -246,7 +255,7 @@ mod tests {
     use protocol::{CavId, EgoMotion, PointCloud, Pose};
 
     use super::*;
-    use crate::pgc::LocalizerTimes;
+    use crate::pgc::{LocalizerInput, LocalizerTimes};
 
     /// A vehicle that drives at 10 m/s along x; every sweep holds its number of points.
     #[derive(Debug, Default)]
@@ -271,14 +280,18 @@ mod tests {
     }
 
     impl Localize for Road {
-        fn localize(&mut self, cloud: &PointCloud) -> Result<Localization, LocalizerError> {
+        fn localize_sweep(&mut self, sweep: LocalizerInput<'_>) -> Result<Localization, LocalizerError> {
             self.globals.fetch_add(1, Ordering::Relaxed);
-            Ok(self.result(cloud))
+            Ok(self.result(sweep.cloud))
         }
 
-        fn localize_near(&mut self, cloud: &PointCloud, _: &Isometry3<f64>) -> Result<Localization, LocalizerError> {
+        fn localize_near(
+            &mut self,
+            sweep: LocalizerInput<'_>,
+            _: &Isometry3<f64>,
+        ) -> Result<Localization, LocalizerError> {
             self.nears.fetch_add(1, Ordering::Relaxed);
-            Ok(self.result(cloud))
+            Ok(self.result(sweep.cloud))
         }
     }
 
@@ -302,7 +315,7 @@ mod tests {
             let cloud = PointCloud { xyzi: vec![[0.0; 4]; sweep] };
             let capture_nanos = sweep as u64 * 100_000_000;
             let motion = EgoMotion { speed_mps: Some(10.0), yaw_rate_rad_s };
-            let input = PoseInput { cav: &cav, capture_nanos, cloud: &cloud, measured: None, motion };
+            let input = PoseInput { cav: &cav, capture_nanos, cloud: &cloud, levels: None, measured: None, motion };
             (source.estimate(&input), source.observe(&input))
         })
     }

@@ -7,6 +7,7 @@ use agent_offline::evaluation::{
     Evaluated, EvaluatedSweep, EvaluationError, EvaluationOptions, IntegritySummary, LocalizationSummary, evaluate,
     evaluate_source, reliability_charts, write_csv, write_error_table,
 };
+use agent_offline::head_files::{ENCODER_FILE, encoder_of};
 use agent_offline::icp_map::{IcpMapPose, read_map};
 use agent_offline::sweep_database::read_database;
 use anyhow::Context;
@@ -39,7 +40,7 @@ pub(crate) struct Args {
     /// Data sets, splits or scenarios of the heads' scenes; the layout is detected.
     #[arg(long, value_name = "DIR", num_args = 1.., required = true)]
     scene: Vec<PathBuf>,
-    /// Weights of the encoder [default: pgc-encoder.safetensors beside each head].
+    /// Weights of the encoder, or of a detector that has it [default: those that each head names].
     #[arg(long, value_name = "FILE")]
     encoder: Option<PathBuf>,
     /// Weights of the heads: FILE for all scenes, or MAP=FILE and MAP:SEED=FILE for generated ones [SEED: 0]. The
@@ -256,7 +257,8 @@ impl Args {
     }
 
     fn encoder(&self, head: &Path) -> PathBuf {
-        self.encoder.clone().unwrap_or_else(|| head.with_file_name("pgc-encoder.safetensors"))
+        let beside = || head.with_file_name(ENCODER_FILE);
+        self.encoder.clone().or_else(|| encoder_of(head).ok()).unwrap_or_else(beside)
     }
 
     fn evaluate(&self, subject: Subject, scenes: &[PathBuf]) -> anyhow::Result<Evaluated> {

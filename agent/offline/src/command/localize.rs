@@ -23,7 +23,7 @@ pub(crate) struct Args {
     /// Data sets, splits or scenarios.
     #[arg(long, value_name = "DIR", num_args = 1.., required = true)]
     scene: Vec<PathBuf>,
-    /// Weights of the encoder.
+    /// Weights of the encoder, or of a detector that has it.
     #[arg(long, value_name = "FILE")]
     encoder: PathBuf,
     /// Weights of the heads: FILE for all scenes, or MAP=FILE and MAP:SEED=FILE for generated ones [SEED: 0].
@@ -100,8 +100,14 @@ impl Args {
                     }
                 };
                 let capture_nanos = frame.capture_nanos;
-                let input =
-                    PoseInput { cav, capture_nanos, cloud: &frame.points, measured: None, motion: frame.motion() };
+                let input = PoseInput {
+                    cav,
+                    capture_nanos,
+                    cloud: &frame.points,
+                    levels: None,
+                    measured: None,
+                    motion: frame.motion(),
+                };
                 rows.push(PoseRow { cav, capture_nanos, estimate: source.estimate(&input) });
                 source.observe(&input);
             }

@@ -37,7 +37,7 @@ pub(crate) struct Args {
     /// Weights of the head of the place: a file, the folder that `agent map` wrote, or a released one (town1, town4).
     #[arg(long, value_name = "FILE")]
     head: String,
-    /// Weights of the encoder [default: beside the head, or the released one that the head names].
+    /// Weights of the encoder, or of a detector that has it [default: those that the head names, beside it or released].
     #[arg(long, value_name = "FILE")]
     encoder: Option<PathBuf>,
     /// Direction of the y axis in files that belong to no data set: left, right (CARLA, OPV2V), or whichever gives a pose,

@@ -41,7 +41,7 @@ pub(crate) struct Args {
     /// Largest number of training sweeps, evenly spread [default: as many as there is time for].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     sweeps: Option<u32>,
-    /// Weights of the encoder [default: the released one].
+    /// Weights of the encoder, or of a detector, whose backbone then serves both [default: the released encoder].
     #[arg(long, value_name = "FILE")]
     encoder: Option<PathBuf>,
     /// Seed of parameters and order.

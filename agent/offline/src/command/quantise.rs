@@ -17,7 +17,7 @@ pub(crate) struct Args {
     /// Data sets, splits or scenarios of the scene.
     #[arg(long, value_name = "DIR", num_args = 1.., required = true)]
     scene: Vec<PathBuf>,
-    /// Weights of the encoder.
+    /// Weights of the encoder, or of a detector that has it and its scales.
     #[arg(long, value_name = "FILE")]
     encoder: PathBuf,
     /// Weights of the head; its parameters stay as they are.

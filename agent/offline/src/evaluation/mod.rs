@@ -142,7 +142,7 @@ pub fn evaluate_source(
         let Frame { cav, capture_nanos, points, .. } = frame;
         let start = Instant::now();
         let (capture_nanos, motion) = (*capture_nanos, frame.motion());
-        let input = PoseInput { cav, capture_nanos, cloud: points, measured: measured.as_ref(), motion };
+        let input = PoseInput { cav, capture_nanos, cloud: points, levels: None, measured: measured.as_ref(), motion };
         let estimate = source.estimate(&input);
         source.observe(&input);
         let times = LocalizerTimes { solve: start.elapsed(), ..LocalizerTimes::default() };

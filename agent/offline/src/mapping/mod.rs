@@ -24,7 +24,7 @@ use crate::training::{
     SweepAugmentation, SweepList, train_scene_on,
 };
 use localization::pgc::confidence::{CONFIDENCE_KEY, Confidence, ConfidenceModel, FitReport};
-use localization::pgc::{Localizer, LocalizerError, SceneEncoder};
+use localization::pgc::{CellEncoder, Localizer, LocalizerError};
 use perception::inference::Inference;
 use perception::int8::{SCALES_KEY, ScaleSearch};
 use perception::train::{Length, RunConfig, TrainingError};
@@ -262,7 +262,8 @@ impl Map<'_> {
             ));
             return Ok(plan);
         }
-        let (encoder, _) = SceneEncoder::load(&self.config.encoder, run.device)?;
+        let (encoder, _) =
+            CellEncoder::load(&self.config.encoder, Inference { device: run.device, ..Inference::default() })?;
         let wanted = self.config.most_sweeps.unwrap_or(usize::MAX).min(sweeps.training.len());
         let probes = Arc::new(sweeps.list.subset(&thinned(&sweeps.training, PROBES)));
         let unchanged = SweepAugmentation { copies: 1, turn_rad: 0.0, keep: 1.0 };
@@ -287,7 +288,7 @@ impl Map<'_> {
         let left_s = self.config.time.as_secs_f64() - self.seconds();
         let plan = Plan::new(wanted, sweeps.held_out.len(), sweep_s, left_s);
         let encoded = plan.training * plan.copies;
-        let needed = feature_bytes(encoded, encoder.config().cell_channels());
+        let needed = feature_bytes(encoded, encoder.format().cell_channels());
         if let Some(free) = too_little_memory(needed) {
             return Err(MapError::Memory { sweeps: encoded, needed, free });
         }

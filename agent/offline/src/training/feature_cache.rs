@@ -10,8 +10,8 @@ use tch::{Device, Kind, TchError, Tensor, no_grad};
 
 use super::error::LocalizerTrainError;
 use super::sweep_store::{SweepList, yaw};
-use super::turned_sweep::{CELLS, TurnedSweep};
-use localization::pgc::{Cell, SceneEncoder, SweepVoxels, VoxelBatch};
+use super::turned_sweep::{CELLS, PosedSweep, TurnedSweep};
+use localization::pgc::{Cell, CellEncoder, PreparedSweep};
 use perception::train::{Prefetch, RunConfig};
 
 /// Number of sweeps of one forward pass.
@@ -57,20 +57,20 @@ impl FeatureCache {
     /// [`LocalizerTrainError`] when a sweep cannot be read or encoded, or none has a pose.
     pub(crate) fn build(
         list: &Arc<SweepList>,
-        encoder: &SceneEncoder,
+        encoder: &CellEncoder,
         augmentation: SweepAugmentation,
         run: &RunConfig,
         progress: &mut dyn FnMut(usize, usize),
     ) -> Result<Self, LocalizerTrainError> {
         let RunConfig { seed, loader_threads, precision, device, .. } = *run;
         let total = list.len() * augmentation.copies.max(1);
-        let config = encoder.config().clone();
+        let format = encoder.format().clone();
         let source = Arc::clone(list);
         let prepare = move |batch: u64| -> Vec<TurnedSweep> {
             let numbers = (batch * BATCH..(batch + 1) * BATCH).filter(|&number| (number as usize) < total);
             let prepared = numbers.map(|number| {
                 let (index, copy) = (number as usize % source.len(), number as usize / source.len());
-                let stored = source.read(index, config.range_m)?;
+                let (frame, world_from_sensor) = source.posed_frame(index)?;
                 let mut rng = ChaCha8Rng::seed_from_u64(seed);
                 rng.set_stream(number);
                 let (turn, keep) = match copy {
@@ -80,13 +80,14 @@ impl FeatureCache {
                         (yaw(rng.random_range(-angle..angle)), rng.random_range(augmentation.keep..=1.0))
                     }
                 };
-                Some(TurnedSweep::new(&stored, &turn, keep, &mut rng, &config))
+                let sweep = PosedSweep { points: frame.points.xyzi, world_from_sensor };
+                Some(TurnedSweep::new(sweep, &turn, keep, &mut rng, &format))
             });
             prepared.flatten().collect()
         };
         let mut loader = Prefetch::start(loader_threads, 0, prepare);
         let rows = (total * CELLS) as i64;
-        let mut builder = Builder::new(rows, encoder.config().cell_channels(), device)?;
+        let mut builder = Builder::new(rows, encoder.format().cell_channels(), device)?;
         let mut done = 0;
         while done < total {
             let batch = loader.next_batch()?;
@@ -150,30 +151,29 @@ impl Builder {
     fn add(
         &mut self,
         batch: &[TurnedSweep],
-        encoder: &SceneEncoder,
+        encoder: &CellEncoder,
         kind: Kind,
         device: Device,
-    ) -> Result<(), TchError> {
-        let sweeps: Vec<&SweepVoxels> = batch.iter().map(|prepared| &prepared.voxels).collect();
-        let voxels = VoxelBatch::new(&sweeps, encoder.config(), device)?;
-        let features = encoder.encode(&voxels, kind)?;
+    ) -> Result<(), LocalizerTrainError> {
+        let sweeps: Vec<&PreparedSweep> = batch.iter().map(|turned| &turned.sweep).collect();
+        let encoded = encoder.encode(&sweeps, kind)?;
         let mut rows = Vec::new();
         let filled = self.places.len() as i64;
-        for (number, prepared) in batch.iter().enumerate() {
-            let first = voxels.cell_rows(number).start;
-            rows.extend(prepared.rows.iter().map(|&row| first + row as i64));
-            self.sweep_of_cell.extend(prepared.rows.iter().map(|_| (self.poses.len()) as i64));
-            self.places.extend(prepared.rows.iter().map(|&row| prepared.voxels.cells()[row]));
-            self.points.push(prepared.points);
-            self.poses.push(prepared.world_from_sensor);
+        for (turned, of_sweep) in batch.iter().zip(&encoded.rows) {
+            rows.extend(turned.rows.iter().map(|&row| of_sweep.start + row as i64));
+            self.sweep_of_cell.extend(turned.rows.iter().map(|_| (self.poses.len()) as i64));
+            self.places.extend(turned.rows.iter().map(|&row| turned.sweep.cells()[row]));
+            self.points.push(turned.points);
+            self.poses.push(turned.world_from_sensor);
         }
         let rows = Tensor::f_from_slice(&rows)?.f_to_device(device)?;
         no_grad(|| {
             let mut place = self.cells.f_narrow(0, filled, rows.size()[0])?;
-            place.f_copy_(&features.cells.f_index_select(0, &rows)?)?;
-            self.sweeps.push(features.sweeps);
-            Ok(())
-        })
+            place.f_copy_(&encoded.features.cells.f_index_select(0, &rows)?)?;
+            self.sweeps.push(encoded.features.sweeps);
+            Ok::<_, TchError>(())
+        })?;
+        Ok(())
     }
 
     fn finish(self, device: Device) -> Result<FeatureCache, LocalizerTrainError> {

@@ -13,7 +13,7 @@ use tch::{Device, Kind, TchError, Tensor, no_grad};
 use super::error::LocalizerTrainError;
 use super::{CELLS, FeatureCache, SweepAugmentation, SweepList};
 use localization::baselines::sgloc::{SgLoc, SgLocConfig, SgLocLocalizer};
-use localization::pgc::{LocalizerError, SceneEncoder, SceneEncoderConfig};
+use localization::pgc::{CellEncoder, LocalizerError, SceneEncoder, SceneEncoderConfig};
 use perception::train::{RunConfig, Trained, Trainer};
 use perception::weights::{CONFIG_KEY, KIND_KEY, Weights};
 
@@ -68,14 +68,13 @@ pub fn train_sgloc(
     run.start()?;
     let list = Arc::new(SweepList::open(&config.scenes)?);
     let (encoder, _) = SceneEncoder::load(&config.encoder, run.device)?;
+    let encoder_config = encoder.config().clone();
+    let encoder = CellEncoder::sparse(encoder, run.device);
     let unchanged = SweepAugmentation { copies: 1, turn_rad: 0.0, keep: 1.0 };
     let mut encoded = |done, total| observe(&SgLocReport::Encoding(done, total));
     let cache = FeatureCache::build(&list, &encoder, unchanged, run, &mut encoded)?;
-    let network_config = SgLocConfig {
-        scene_name: config.scene_name.clone(),
-        origin_m: cache.origin_m,
-        encoder: encoder.config().clone(),
-    };
+    let network_config =
+        SgLocConfig { scene_name: config.scene_name.clone(), origin_m: cache.origin_m, encoder: encoder_config };
     let variables = VarStore::new(run.device);
     let mut network = SgLoc::new(&variables.root(), &network_config)?;
     let draw = Draw { seed: run.seed, cells: cache.cell_count(), device: run.device };

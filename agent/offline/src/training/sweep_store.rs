@@ -37,11 +37,6 @@ impl StoredSweep {
         Self { world, drive, world_from_sensor, points: points.iter().map(stored).collect() }
     }
 
-    /// Number of points.
-    pub(crate) fn point_count(&self) -> usize {
-        self.points.len()
-    }
-
     /// x, y, z of every point, metres in the sensor frame.
     pub(crate) fn points(&self) -> impl Iterator<Item = [f32; 3]> + '_ {
         self.points.iter().map(|point| point.map(|axis| f32::from(axis) * UNIT_M))

@@ -1,18 +1,24 @@
 //! A sweep, augmented for the training of a network of one scene.
 
-use nalgebra::Isometry3;
+use nalgebra::{Isometry3, Point3};
 use rand::Rng;
 
 use super::pairs::choose;
-use super::sweep_store::StoredSweep;
-use localization::pgc::{SceneEncoderConfig, SweepVoxels};
+use localization::pgc::{PreparedSweep, SweepFormat};
 
 /// Number of cells of a sweep that are training examples.
 pub(crate) const CELLS: usize = 400;
 
+/// A sweep with its true pose.
+pub(super) struct PosedSweep {
+    /// `[N]` of x, y, z (metres, sensor frame) and intensity.
+    pub(super) points: Vec<[f32; 4]>,
+    pub(super) world_from_sensor: Isometry3<f64>,
+}
+
 /// A sweep, rotated and subsampled.
 pub(super) struct TurnedSweep {
-    pub(super) voxels: SweepVoxels,
+    pub(super) sweep: PreparedSweep,
     /// Indices of the cells that are training examples.
     pub(super) rows: Vec<usize>,
     /// Number of points within the range of the encoder, before any is left out.
@@ -24,15 +30,27 @@ pub(super) struct TurnedSweep {
 impl TurnedSweep {
     /// The sweep of a sensor in the orientation `turned_from_sensor`, each point kept with a probability.
     pub(super) fn new(
-        stored: &StoredSweep,
+        sweep: PosedSweep,
         turned_from_sensor: &Isometry3<f64>,
         keep: f64,
         rng: &mut impl Rng,
-        config: &SceneEncoderConfig,
+        format: &SweepFormat,
     ) -> Self {
-        let voxels = stored.turned_voxels(turned_from_sensor, keep, rng, config);
-        let rows = choose(voxels.cells(), CELLS, rng);
-        let world_from_sensor = stored.world_from_sensor * turned_from_sensor.inverse();
-        Self { voxels, rows, points: stored.point_count(), world_from_sensor }
+        let PosedSweep { mut points, world_from_sensor } = sweep;
+        let range_m = format.range_m() as f32;
+        points.retain(|[x, y, z, _]| x * x + y * y <= range_m * range_m && z.is_finite());
+        let in_range = points.len();
+        points.retain(|_| keep >= 1.0 || rng.random_bool(keep));
+        let turn: Isometry3<f32> = turned_from_sensor.cast();
+        if turn != Isometry3::identity() {
+            points.iter_mut().for_each(|[x, y, z, _]| {
+                let turned = turn * Point3::new(*x, *y, *z);
+                (*x, *y, *z) = (turned.x, turned.y, turned.z);
+            });
+        }
+        let sweep = format.prepare(&points);
+        let rows = choose(sweep.cells(), CELLS, rng);
+        let world_from_sensor = world_from_sensor * turned_from_sensor.inverse();
+        Self { sweep, rows, points: in_range, world_from_sensor }
     }
 }

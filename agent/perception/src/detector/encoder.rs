@@ -2,6 +2,7 @@
 
 use tch::{Device, TchError, Tensor};
 
+use super::backbone_level::BackboneLevel;
 use super::int8_backbone::{CANVAS, Int8Backbone, observe_backbone};
 use crate::int8::{ActivationScales, Quantisation, QuantiseError, ScaleSearch};
 use crate::layers::backbone::BevBackbone;
@@ -72,17 +73,26 @@ impl BevEncoder {
         Ok(Canvas(canvas.f_permute([0, 3, 1, 2])?))
     }
 
-    /// Feature map `[1, C, H', W']` of a canvas, contiguous.
-    pub(super) fn features(&self, canvas: &Canvas) -> Result<Tensor, TchError> {
+    /// Levels of the backbone for a canvas.
+    pub(super) fn levels(&self, canvas: &Canvas) -> Result<Vec<BackboneLevel>, TchError> {
+        match &self.layers {
+            Layers::Float { backbone, .. } => Ok(BackboneLevel::in_float(backbone.levels_of(&canvas.0, false))),
+            Layers::Int8 { backbone, .. } => backbone.levels(&canvas.0),
+        }
+    }
+
+    /// Feature map `[1, C, H', W']` of the levels of a canvas, contiguous.
+    pub(super) fn features(&self, levels: &[BackboneLevel]) -> Result<Tensor, TchError> {
+        let maps: Vec<Tensor> = levels.iter().map(|level| level.values().shallow_clone()).collect();
         match &self.layers {
             Layers::Float { backbone, shrink, .. } => {
-                let wide = backbone.forward(&canvas.0, false);
+                let wide = backbone.upsampled(&maps, false);
                 match shrink {
                     Some(shrink) => shrink.forward_contiguous(&wide),
                     None => wide.f_contiguous(),
                 }
             }
-            Layers::Int8 { backbone, .. } => backbone.forward(&canvas.0),
+            Layers::Int8 { backbone, .. } => backbone.features(&maps),
         }
     }
 

@@ -2,7 +2,8 @@
 
 use tch::{TchError, Tensor};
 
-use crate::int8::{ActivationScales, Int8Convolution, QuantiseError, ScaleSearch};
+use super::backbone_level::BackboneLevel;
+use crate::int8::{ActivationScales, Int8Convolution, Quantisation, QuantiseError, ScaleSearch};
 use crate::layers::backbone::BevBackbone;
 use crate::layers::convolution::{ConvLayer, contiguous_map};
 use crate::layers::shrink::Shrink;
@@ -16,6 +17,8 @@ const UPSAMPLED: &str = "backbone.upsampled";
 #[derive(Debug)]
 pub(super) struct Int8Backbone {
     blocks: Vec<Vec<Int8Convolution>>,
+    /// Meaning of the values behind each block.
+    quantisations: Vec<Quantisation>,
     deblocks: Vec<Int8Convolution>,
     /// The last of them gives `f32`.
     shrink: Vec<Int8Convolution>,
@@ -34,7 +37,7 @@ impl Int8Backbone {
     ) -> Result<Option<Self>, QuantiseError> {
         let (Some((levels, up)), Some(shrink)) = (backbone.plain_layers(), shrink) else { return Ok(None) };
         let mut input = scales.get(CANVAS)?;
-        let (mut blocks, mut deblocks) = (Vec::new(), Vec::new());
+        let (mut blocks, mut quantisations, mut deblocks) = (Vec::new(), Vec::new(), Vec::new());
         let upsampled = scales.get(UPSAMPLED)?;
         for (level, (layers, deblock)) in levels.into_iter().zip(up).enumerate() {
             let mut block = Vec::new();
@@ -44,6 +47,7 @@ impl Int8Backbone {
                 input = output;
             }
             blocks.push(block);
+            quantisations.push(input);
             deblocks.push(deblock.int8(input, Some(upsampled.scale))?);
         }
         let mut input = upsampled;
@@ -55,21 +59,31 @@ impl Int8Backbone {
             shrunk.push(layer.int8(input, output.map(|output| output.scale))?);
             input = output.unwrap_or(input);
         }
-        Ok(Some(Self { blocks, deblocks, shrink: shrunk }))
+        Ok(Some(Self { blocks, quantisations, deblocks, shrink: shrunk }))
     }
 
-    /// Feature map `[1, C, H', W']`, `f32` and contiguous, of the quantised canvas `[1, C_pillar, H, W]`.
+    /// Levels of the quantised canvas `[1, C_pillar, H, W]`.
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub(super) fn forward(&self, canvas: &Tensor) -> Result<Tensor, TchError> {
+    pub(super) fn levels(&self, canvas: &Tensor) -> Result<Vec<BackboneLevel>, TchError> {
         let mut x = canvas.shallow_clone();
         let mut levels = Vec::with_capacity(self.blocks.len());
-        for (block, deblock) in self.blocks.iter().zip(&self.deblocks) {
+        for (block, &quantisation) in self.blocks.iter().zip(&self.quantisations) {
             x = through(block, x)?;
-            levels.push(deblock.forward(&x)?);
+            levels.push(BackboneLevel::in_integers(x.shallow_clone(), quantisation));
         }
-        contiguous_map(&through(&self.shrink, Tensor::f_cat(&levels, 1)?)?)
+        Ok(levels)
+    }
+
+    /// Feature map `[1, C, H', W']`, `f32` and contiguous, of the levels' values.
+    ///
+    /// # Errors
+    /// Those of the tensor library.
+    pub(super) fn features(&self, levels: &[Tensor]) -> Result<Tensor, TchError> {
+        let upsampled = self.deblocks.iter().zip(levels).map(|(deblock, level)| deblock.forward(level));
+        let upsampled: Vec<Tensor> = upsampled.collect::<Result<_, _>>()?;
+        contiguous_map(&through(&self.shrink, Tensor::f_cat(&upsampled, 1)?)?)
     }
 }
 

@@ -1,5 +1,6 @@
 //! Detector for inference: from one sweep to the transmitted feature map and boxes.
 
+mod backbone_level;
 mod encoder;
 mod error;
 mod int8_backbone;
@@ -13,6 +14,7 @@ use support::stage_times::StageTimes;
 use tch::nn::VarStore;
 use tch::{Device, Kind, Tensor};
 
+pub use backbone_level::BackboneLevel;
 pub use error::DetectorError;
 pub use output::{Encoded, Heads};
 
@@ -43,6 +45,7 @@ use crate::weights::Weights;
 pub struct Detector {
     config: DetectorConfig,
     sha256: String,
+    encoder_sha256: String,
     device: Device,
     crop: Crop,
     voxeliser: Voxeliser,
@@ -72,7 +75,8 @@ impl Detector {
         let network = VarStore::new(device);
         let pillars = PointPillars::new(&network.root(), config)?;
         weights.copy_into(&network)?;
-        let detector = Self { sha256: weights.sha256().to_owned(), ..Self::from_network(pillars) };
+        let (sha256, encoder_sha256) = (weights.sha256().to_owned(), encoder_sha256(weights));
+        let detector = Self { sha256, encoder_sha256, ..Self::from_network(pillars) };
         match weights.activation_scales()? {
             Some(scales) if device == Device::Cpu => {
                 Ok(detector.quantised(&scales).map_err(|error| weights.quantise_error(error))?)
@@ -94,6 +98,7 @@ impl Detector {
     pub fn from_network(network: PointPillars) -> Self {
         tch::no_grad(|| Self {
             sha256: String::new(),
+            encoder_sha256: String::new(),
             device: network.device(),
             crop: Crop::for_detector(&network.config),
             voxeliser: Voxeliser::for_detector(&network.config),
@@ -128,6 +133,12 @@ impl Detector {
     #[must_use]
     pub fn sha256(&self) -> &str {
         &self.sha256
+    }
+
+    /// [`encoder_sha256`] of its weights file; empty if it was not read from one.
+    #[must_use]
+    pub fn encoder_sha256(&self) -> &str {
+        &self.encoder_sha256
     }
 
     /// Hash of the weights for the wire, where it identifies compatible feature maps; all zeros if it was not read from
@@ -221,9 +232,18 @@ impl Detector {
         times.lap("voxelise");
         let canvas = self.encoder.scatter(&pillars)?;
         times.lap("pillars");
-        let features = tch::no_grad(|| self.encoder.features(&canvas))?;
+        let (features, levels) = tch::no_grad(|| {
+            let levels = self.encoder.levels(&canvas)?;
+            Ok::<_, DetectorError>((self.encoder.features(&levels)?, levels))
+        })?;
         times.lap("backbone");
-        Ok(Encoded { features, points: self.cropped.len(), pillars: pillars.len(), times: times.into_timings() })
+        Ok(Encoded {
+            features,
+            levels,
+            points: self.cropped.len(),
+            pillars: pillars.len(),
+            times: times.into_timings(),
+        })
     }
 
     /// The transmitted form of an encoded feature map `[1, C, H, W]`: the compressor's code `[1, C / ratio, H, W]`; the
@@ -327,6 +347,12 @@ impl Detector {
         let channels = self.config.feature_channels() as u32;
         Ok(BevFeatures { grid: self.grid(), channels, code_of: None, values: flat(&map)? })
     }
+}
+
+/// SHA-256 of the encoder in a detector's weights, pillars and backbone: the same for methods that share it.
+#[must_use]
+pub fn encoder_sha256(weights: &Weights) -> String {
+    weights.sha256_of(|name| name.starts_with("pillar_vfe.") || name.starts_with("backbone."))
 }
 
 /// A feature map `[1, C, H, W]` or `[C, H, W]` of the expected shape as `[1, C, H, W]`, channel by channel in memory.

@@ -3,6 +3,7 @@
 use protocol::StageTiming;
 use tch::{TchError, Tensor};
 
+use super::backbone_level::BackboneLevel;
 use super::error::DetectorError;
 use crate::layers::head::HeadOutput;
 
@@ -12,6 +13,8 @@ pub struct Encoded {
     /// `[1, C, H, W]` `f32`, contiguous, before the compressor if there is one:
     /// [`Detector::compressed`](super::Detector::compressed) gives the transmitted feature map.
     pub features: Tensor,
+    /// Levels of the backbone, from fine to coarse.
+    pub levels: Vec<BackboneLevel>,
     /// Number of points inside the area.
     pub points: usize,
     /// Number of pillars.

@@ -48,8 +48,7 @@ impl BevBackbone {
 
     /// `[N, C, H, W]` to the concatenated levels `[N, sum of C_up, H', W']`.
     pub fn forward(&self, x: &Tensor, train: bool) -> Tensor {
-        let unfused = |level: &Tensor| Ok(level.shallow_clone());
-        self.run(x, train, unfused).expect("a backbone without fusion has no shape from outside")
+        self.upsampled(&self.levels_of(x, train), train)
     }
 
     /// AttFuse's backbone: after every level the agents of a sample are fused before the up-sampling branch, while each
@@ -62,13 +61,25 @@ impl BevBackbone {
     /// # Errors
     /// Those of the tensor library, when `record_len` does not add up to the number of maps.
     pub fn forward_fused(&self, x: &Tensor, record_len: &[i64], train: bool) -> Result<Tensor, TchError> {
-        self.run(x, train, |level| attend_samples(level, record_len))
+        let levels = self.levels_of(x, train);
+        let fused = levels.iter().map(|level| attend_samples(level, record_len));
+        Ok(self.upsampled(&fused.collect::<Result<Vec<_>, _>>()?, train))
     }
 
     /// Number of levels.
     #[must_use]
     pub fn levels(&self) -> usize {
         self.blocks.len()
+    }
+
+    /// Outputs of all levels for a canvas `[N, C, H, W]`, each the input of the next.
+    pub fn levels_of(&self, canvas: &Tensor, train: bool) -> Vec<Tensor> {
+        let mut x = canvas.shallow_clone();
+        let level = |level| {
+            x = self.level(level, &x, train);
+            x.shallow_clone()
+        };
+        (0..self.levels()).map(level).collect()
     }
 
     /// Output of one level for the output of the level above it, or for the canvas.
@@ -110,21 +121,6 @@ impl BevBackbone {
             blocks: self.blocks.iter().map(fold).collect(),
             deblocks: self.deblocks.iter().map(ConvLayer::folded).collect(),
         }
-    }
-
-    fn run(
-        &self,
-        x: &Tensor,
-        train: bool,
-        fuse: impl Fn(&Tensor) -> Result<Tensor, TchError>,
-    ) -> Result<Tensor, TchError> {
-        let mut x = x.shallow_clone();
-        let mut levels = Vec::with_capacity(self.blocks.len());
-        for level in 0..self.blocks.len() {
-            x = self.level(level, &x, train);
-            levels.push(fuse(&x)?);
-        }
-        Ok(self.upsampled(&levels, train))
     }
 }
 

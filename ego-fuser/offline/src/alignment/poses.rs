@@ -63,6 +63,7 @@ impl AlignmentMethod for Poses {
             cav: &frame.cav,
             capture_nanos: frame.capture_nanos,
             cloud: &frame.points,
+            levels: None,
             measured: measured.as_ref(),
             motion: frame.motion(),
         };

@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::time::Instant;
 
-use protocol::{NoPoseReason, PointCloud, PoseEstimate};
+use protocol::{NoPoseReason, PoseEstimate};
 use tch::nn::VarStore;
 use tch::{Device, Tensor, no_grad};
 
@@ -13,7 +13,7 @@ use super::network::DiffLoc;
 use super::range_image::CHANNELS;
 use crate::baselines::regressed_pose::{FULL_CONFIDENCE, no_pose, upright};
 use crate::pgc::pose_solver::MIN_CELLS;
-use crate::pgc::{Localization, Localize, LocalizerError, LocalizerTimes};
+use crate::pgc::{Localization, Localize, LocalizerError, LocalizerInput, LocalizerTimes};
 use perception::weights::Weights;
 
 /// A DiffLoc network of one scene, for single sweeps.
@@ -60,7 +60,8 @@ impl DiffLocLocalizer {
 }
 
 impl Localize for DiffLocLocalizer {
-    fn localize(&mut self, cloud: &PointCloud) -> Result<Localization, LocalizerError> {
+    fn localize_sweep(&mut self, sweep: LocalizerInput<'_>) -> Result<Localization, LocalizerError> {
+        let cloud = sweep.cloud;
         let mut times = LocalizerTimes::default();
         let start = Instant::now();
         let config = self.network.config();
@@ -101,6 +102,7 @@ mod tests {
     use crate::baselines::load_baseline;
     use crate::pgc::pose_solver::PoseSolver;
     use perception::weights::{CONFIG_KEY, KIND_KEY, Precision, save};
+    use protocol::PointCloud;
 
     fn config() -> DiffLocConfig {
         DiffLocConfig {

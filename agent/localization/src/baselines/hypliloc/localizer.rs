@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::time::Instant;
 
-use protocol::{NoPoseReason, PointCloud, PoseEstimate};
+use protocol::{NoPoseReason, PoseEstimate};
 use tch::nn::VarStore;
 use tch::{Device, Kind, TchError, Tensor, no_grad};
 
@@ -11,7 +11,7 @@ use super::config::HypLiLocConfig;
 use super::network::HypLiLoc;
 use super::sweep_input::{InputBatch, SweepInput};
 use crate::baselines::regressed_pose::{FULL_CONFIDENCE, no_pose, upright};
-use crate::pgc::{Localization, Localize, LocalizerError, LocalizerTimes};
+use crate::pgc::{Localization, Localize, LocalizerError, LocalizerInput, LocalizerTimes};
 use perception::weights::Weights;
 
 /// Shortest heading that is a direction.
@@ -62,7 +62,8 @@ impl HypLiLocLocalizer {
 }
 
 impl Localize for HypLiLocLocalizer {
-    fn localize(&mut self, cloud: &PointCloud) -> Result<Localization, LocalizerError> {
+    fn localize_sweep(&mut self, sweep: LocalizerInput<'_>) -> Result<Localization, LocalizerError> {
+        let cloud = sweep.cloud;
         let mut times = LocalizerTimes::default();
         let start = Instant::now();
         let points_m: Vec<[f32; 3]> = cloud.xyzi.iter().map(|&[x, y, z, _]| [x, y, z]).collect();
@@ -99,6 +100,7 @@ mod tests {
     use crate::baselines::load_baseline;
     use crate::baselines::sgloc::SgLocLocalizer;
     use crate::pgc::pose_solver::PoseSolver;
+    use protocol::PointCloud;
 
     fn config() -> HypLiLocConfig {
         HypLiLocConfig { scene_name: "test".into(), origin_m: [1000.0, -2000.0, 30.0], scale_m: [100.0, 200.0, 1.0] }

@@ -4,14 +4,14 @@ use std::path::Path;
 use std::time::Instant;
 
 use perception::weights::Weights;
-use protocol::{NoPoseReason, PointCloud};
+use protocol::NoPoseReason;
 use tch::nn::VarStore;
 use tch::{Device, Kind, Tensor, no_grad};
 
 use super::{SgLoc, SgLocConfig};
 use crate::baselines::regressed_pose::no_pose;
 use crate::pgc::error::LocalizerError;
-use crate::pgc::localize::{Localization, Localize, LocalizerTimes, SceneCoordinates, choose_evenly};
+use crate::pgc::localize::{Localization, Localize, LocalizerInput, LocalizerTimes, SceneCoordinates, choose_evenly};
 use crate::pgc::pose_solver::{MIN_CELLS, PoseSolver};
 use crate::pgc::scene_encoder::SceneFeatures;
 use crate::pgc::voxel_batch::VoxelBatch;
@@ -72,7 +72,8 @@ impl SgLocLocalizer {
 }
 
 impl Localize for SgLocLocalizer {
-    fn localize(&mut self, cloud: &PointCloud) -> Result<Localization, LocalizerError> {
+    fn localize_sweep(&mut self, sweep: LocalizerInput<'_>) -> Result<Localization, LocalizerError> {
+        let cloud = sweep.cloud;
         let mut times = LocalizerTimes::default();
         let start = Instant::now();
         let config = self.network.encoder().config();
@@ -107,6 +108,7 @@ mod tests {
 
     use super::*;
     use crate::pgc::{Localizer, SceneEncoderConfig};
+    use protocol::PointCloud;
 
     fn config() -> SgLocConfig {
         let encoder = SceneEncoderConfig {

@@ -25,7 +25,7 @@ pub(crate) struct Args {
     /// Seconds between two validations and checkpoints.
     #[arg(long, default_value_t = 120)]
     validate_every: u64,
-    /// Weights of the encoder.
+    /// Weights of the encoder: a scene encoder, or a detector, whose backbone then serves both.
     #[arg(long, value_name = "FILE")]
     encoder: PathBuf,
     /// Head of the same scene to start from, for example to add sweeps of another weather or season; its sizes replace

@@ -4,7 +4,8 @@ use std::sync::Arc;
 
 use super::config::{SceneReport, SceneTrainConfig};
 use crate::training::{FeatureCache, LocalizerTrainError, SweepAugmentation, SweepList};
-use localization::pgc::{SceneEncoder, SceneEncoderConfig};
+use localization::pgc::{CellEncoder, SweepFormat};
+use perception::inference::Inference;
 use perception::train::DataListing;
 
 /// Sweeps of a scene.
@@ -19,7 +20,7 @@ pub(crate) struct SceneSweeps {
 pub(super) struct Features {
     pub(super) training: FeatureCache,
     pub(super) validation: Option<FeatureCache>,
-    pub(super) encoder: SceneEncoderConfig,
+    pub(super) format: SweepFormat,
     pub(super) encoder_sha256: String,
     /// Origin of the training features.
     pub(super) data: DataListing,
@@ -32,7 +33,8 @@ impl Features {
         sweeps: &SceneSweeps,
         observe: &mut dyn FnMut(&SceneReport),
     ) -> Result<Self, LocalizerTrainError> {
-        let (encoder, encoder_sha256) = SceneEncoder::load(&config.encoder, config.run.device)?;
+        let (encoder, encoder_sha256) =
+            CellEncoder::load(&config.encoder, Inference { device: config.run.device, ..Inference::default() })?;
         let mut encode = |list: &Arc<SweepList>, augmentation| {
             let mut progress = |done, total| observe(&SceneReport::Encoding(done, total));
             let cache = FeatureCache::build(list, &encoder, augmentation, &config.run, &mut progress)?;
@@ -43,7 +45,7 @@ impl Features {
         let unchanged = SweepAugmentation { copies: 1, ..config.augmentation };
         let validation = sweeps.validation.as_ref().map(|list| encode(list, unchanged)).transpose()?;
         let data = sweeps.training.data();
-        let encoder = encoder.config().clone();
-        Ok(Self { training, validation, encoder, encoder_sha256, data })
+        let format = encoder.format().clone();
+        Ok(Self { training, validation, format, encoder_sha256, data })
     }
 }

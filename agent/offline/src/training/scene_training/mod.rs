@@ -300,13 +300,13 @@ fn classifier_time(run: &RunConfig) -> Option<Duration> {
 
 /// The configuration of the head for these features.
 fn head_config(config: &SceneTrainConfig, features: &Features) -> Result<SceneHeadConfig, LocalizerTrainError> {
-    let Features { training, encoder, encoder_sha256, .. } = features;
-    let refiner = || key_grid::covering(&training.targets_m, encoder.local_channels());
+    let Features { training, format, encoder_sha256, .. } = features;
+    let refiner = || key_grid::covering(&training.targets_m, format.local_channels());
     Ok(SceneHeadConfig {
         scene_name: config.scene_name.clone(),
         encoder_sha256: encoder_sha256.clone(),
-        cell_channels: encoder.cell_channels(),
-        sweep_channels: encoder.sweep_channels(),
+        cell_channels: format.cell_channels(),
+        sweep_channels: format.sweep_channels(),
         classes: config.classes,
         centres: config.centres,
         width: config.width,

@@ -1,0 +1,172 @@
+//! Levels of a detector's backbone as features of cells.
+
+use std::sync::{Mutex, PoisonError};
+
+use perception::detector::{BackboneLevel, Detector};
+use perception::weights::{KIND_KEY, Weights};
+use tch::{Device, Kind, TchError, Tensor, no_grad};
+
+use super::EncodedCells;
+use super::bev_cells::{BevCells, BevFormat};
+use crate::pgc::error::LocalizerError;
+use crate::pgc::scene_encoder::SceneFeatures;
+
+/// Encoder of a detector, in its fastest form.
+#[derive(Debug)]
+pub(super) struct BackboneEncoder {
+    /// Reuses its buffers from sweep to sweep.
+    detector: Mutex<Detector>,
+    format: BevFormat,
+    device: Device,
+}
+
+impl BackboneEncoder {
+    /// True for the weights of a detector; their files need not name a kind.
+    pub(super) fn is_in(weights: &Weights) -> bool {
+        weights.metadata(KIND_KEY).is_none_or(|kind| kind == "detector")
+    }
+
+    /// The encoder of a detector's weights.
+    pub(super) fn of_detector(weights: &Weights, device: Device) -> Result<Self, LocalizerError> {
+        let config = weights.detector_config()?;
+        let detector = Detector::from_weights(weights, &config, device)?;
+        Ok(Self { format: BevFormat::of_detector(&config), detector: Mutex::new(detector), device })
+    }
+
+    /// Grids of its levels.
+    pub(super) fn format(&self) -> &BevFormat {
+        &self.format
+    }
+
+    /// Features of some sweeps, one after another.
+    pub(super) fn encode(&self, sweeps: &[&BevCells]) -> Result<EncodedCells, LocalizerError> {
+        let (mut cells, mut of_sweeps, mut rows, mut end) = (Vec::new(), Vec::new(), Vec::new(), 0);
+        for sweep in sweeps {
+            let encoded = self.detector.lock().unwrap_or_else(PoisonError::into_inner).encode(&sweep.cloud)?;
+            let features = self.features(sweep, &encoded.levels)?;
+            let start = end;
+            end += sweep.cells().len() as i64;
+            rows.push(start..end);
+            cells.push(features.cells);
+            of_sweeps.push(features.sweeps);
+        }
+        let features = SceneFeatures { cells: Tensor::f_cat(&cells, 0)?, sweeps: Tensor::f_cat(&of_sweeps, 0)? };
+        Ok(EncodedCells { features, rows })
+    }
+
+    /// Features of one sweep from levels that the detector computed from it.
+    pub(super) fn features(&self, sweep: &BevCells, levels: &[BackboneLevel]) -> Result<SceneFeatures, LocalizerError> {
+        let Some((coarsest, places)) = levels.last().zip(sweep.places.last()) else {
+            return Err(LocalizerError::Config("a backbone without levels".into()));
+        };
+        Ok(no_grad(|| {
+            let index = |places: &[i64]| Tensor::f_from_slice(places)?.f_to_device(self.device);
+            let own = levels.iter().zip(&sweep.places).map(|(level, places)| level.of_cells(&index(places)?));
+            let mut parts: Vec<Tensor> = own.collect::<Result<_, _>>()?;
+            let (map, places) = (coarsest.map()?, index(places)?);
+            let channels = map.size()[1];
+            for window in self.format.windows() {
+                let means = mean_over(&map, window)?.f_permute([0, 2, 3, 1])?.f_reshape([-1, channels])?;
+                parts.push(means.f_index_select(0, &places)?);
+            }
+            let mean = map.f_mean_dim([2_i64, 3].as_slice(), false, Kind::Float)?;
+            let sweeps = Tensor::f_cat(&[mean, map.f_amax([2_i64, 3].as_slice(), false)?], 1)?;
+            Ok::<_, TchError>(SceneFeatures { cells: Tensor::f_cat(&parts, 1)?, sweeps })
+        })?)
+    }
+}
+
+/// Mean of a map `[1, C, H, W]` over a window of an odd height and width around each cell, as far as it is on the map.
+fn mean_over(map: &Tensor, [height, width]: [i64; 2]) -> Result<Tensor, TchError> {
+    // One row after one column of the window: a fraction of the additions.
+    let along = |map: &Tensor, size: [i64; 2]| {
+        map.f_avg_pool2d(size, [1; 2], size.map(|edge| edge / 2), false, false, None::<i64>)
+    };
+    along(&along(map, [height, 1])?, [1, width])
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeMap;
+    use std::path::{Path, PathBuf};
+
+    use perception::detector::encoder_sha256;
+    use perception::inference::Inference;
+    use perception::model_config::DetectorConfig;
+    use perception::pillars::point_pillars::PointPillars;
+    use perception::weights::{CONFIG_KEY, Precision, save};
+    use protocol::PointCloud;
+    use tch::nn::VarStore;
+
+    use super::*;
+    use crate::pgc::{CellEncoder, SceneEncoder};
+
+    /// Weights of a small detector; its head is another for another `head`, its encoder the same.
+    fn detector(folder: &Path, head: f64) -> PathBuf {
+        tch::set_num_threads(1);
+        tch::manual_seed(3);
+        let config = DetectorConfig { lidar_range_m: [-12.8, -6.4, -3.0, 12.8, 6.4, 1.0], ..DetectorConfig::lean() };
+        let network = VarStore::new(Device::Cpu);
+        PointPillars::new(&network.root(), &config).unwrap();
+        let _ = no_grad(|| network.variables()["cls_head.bias"].shallow_clone().fill_(head));
+        let path = folder.join(format!("detector-{head}.safetensors"));
+        let metadata: BTreeMap<_, _> = [(CONFIG_KEY.to_owned(), serde_json::to_string(&config).unwrap())].into();
+        save(&path, &network, &metadata, Precision::Single).unwrap();
+        path
+    }
+
+    fn cloud(shift: f32) -> PointCloud {
+        let wall = (0..2000).map(|k| [(k % 50) as f32 * 0.4 - 10.0, 4.0 + shift, (k / 50) as f32 * 0.08 - 2.5, 0.3]);
+        PointCloud { xyzi: wall.collect() }
+    }
+
+    #[test]
+    fn given_levels_have_the_features_that_the_encoder_computes_itself() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = detector(folder.path(), 0.0);
+        let (encoder, sha256) = CellEncoder::load(&path, Inference::default()).unwrap();
+        let mut of_vehicle = Detector::load(&path, Device::Cpu).unwrap();
+        assert_eq!(sha256, of_vehicle.encoder_sha256());
+        let clouds = [cloud(0.0), cloud(1.3)];
+        let sweeps = clouds.each_ref().map(|cloud| encoder.format().prepare(&cloud.xyzi));
+        let both = encoder.encode(&sweeps.each_ref(), Kind::Float).unwrap();
+        let count: usize = sweeps.iter().map(|sweep| sweep.cells().len()).sum();
+        assert_eq!(both.features.cells.size(), [count as i64, encoder.format().cell_channels()]);
+        assert_eq!(both.features.sweeps.size(), [2, encoder.format().sweep_channels()]);
+        for (number, (sweep, cloud)) in sweeps.iter().zip(&clouds).enumerate() {
+            let levels = of_vehicle.encode(cloud).unwrap().levels;
+            let given = encoder.encode_one(sweep, Some(&levels)).unwrap();
+            let rows = &both.rows[number];
+            assert!(given.cells.equal(&both.features.cells.narrow(0, rows.start, rows.end - rows.start)));
+            assert!(given.sweeps.equal(&both.features.sweeps.narrow(0, number as i64, 1)));
+        }
+    }
+
+    #[test]
+    fn an_empty_sweep_has_no_cells_but_features() {
+        let folder = tempfile::tempdir().unwrap();
+        let (encoder, _) = CellEncoder::load(&detector(folder.path(), 0.0), Inference::default()).unwrap();
+        let encoded = encoder.encode(&[&encoder.format().prepare(&[])], Kind::Float).unwrap();
+        assert_eq!(encoded.features.cells.size(), [0, encoder.format().cell_channels()]);
+        assert_eq!(encoded.rows, [0..0]);
+    }
+
+    #[test]
+    fn detectors_that_share_an_encoder_have_one_digest() {
+        let folder = tempfile::tempdir().unwrap();
+        let [one, other] = [0.0, 1.0].map(|head| Weights::load(&detector(folder.path(), head)).unwrap());
+        assert_ne!(one.sha256(), other.sha256());
+        assert_eq!(CellEncoder::sha256_of(&one), CellEncoder::sha256_of(&other));
+        assert_eq!(CellEncoder::sha256_of(&one), encoder_sha256(&one));
+    }
+
+    #[test]
+    fn other_networks_are_no_encoders() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("head.safetensors");
+        let metadata: BTreeMap<_, _> = [(KIND_KEY.to_owned(), "scene head".to_owned())].into();
+        save(&path, &VarStore::new(Device::Cpu), &metadata, Precision::Single).unwrap();
+        let message = CellEncoder::load(&path, Inference::default()).unwrap_err().to_string();
+        assert!(message.contains("scene head") && message.contains(SceneEncoder::KIND), "{message}");
+    }
+}

@@ -1,0 +1,212 @@
+//! BEV cells of a sweep: its occupied cells on the finest level of a detector's backbone.
+
+use perception::crop::Crop;
+use perception::model_config::{DetectorConfig, YAxis};
+use protocol::PointCloud;
+
+use crate::pgc::voxelise::Cell;
+
+/// Edges of the surroundings of a cell, whose mean features are added to its own, metres; as those of the scene encoder.
+const CONTEXT_M: [f64; 2] = [20.0, 60.0];
+
+/// Grids of a detector's backbone.
+#[derive(Debug, Clone, PartialEq)]
+pub struct BevFormat {
+    crop: Crop,
+    /// x, y of the grids' lower corner in the network's frame, metres.
+    low_m: [f32; 2],
+    /// Largest horizontal distance in the detector's area, metres.
+    range_m: f64,
+    /// -1 if the network's y axis points to the right.
+    y_sign: f32,
+    levels: Vec<LevelGrid>,
+}
+
+/// Grid of one level.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct LevelGrid {
+    channels: i64,
+    /// Edge of a cell, metres.
+    cell_m: [f32; 2],
+    width: usize,
+    height: usize,
+}
+
+/// Occupied cells of one sweep.
+#[derive(Debug, Clone)]
+pub struct BevCells {
+    cells: Vec<Cell>,
+    /// For each level the number of the cell that contains each of [`Self::cells`], `y * width + x`.
+    pub(super) places: Vec<Vec<i64>>,
+    /// Points in the detector's area.
+    pub(super) cloud: PointCloud,
+}
+
+impl BevFormat {
+    /// The grids of a detector.
+    #[must_use]
+    pub fn of_detector(config: &DetectorConfig) -> Self {
+        let pillars = config.pillar_grid();
+        let mut stride = 1;
+        let level = |(&channels, &step): (&i64, &i64)| {
+            stride *= step;
+            LevelGrid {
+                channels,
+                cell_m: [0, 1].map(|axis| (config.voxel_size_m[axis] * stride as f64) as f32),
+                width: pillars[0].div_ceil(stride as usize),
+                height: pillars[1].div_ceil(stride as usize),
+            }
+        };
+        let levels = config.num_filters.iter().zip(&config.layer_strides).map(level).collect();
+        let reach_m = |axis: usize| config.lidar_range_m[axis].abs().max(config.lidar_range_m[axis + 3].abs());
+        Self {
+            crop: Crop::for_detector(config),
+            low_m: [0, 1].map(|axis| config.lidar_range_m[axis] as f32),
+            range_m: reach_m(0).hypot(reach_m(1)),
+            y_sign: if config.y_axis == YAxis::Right { -1.0 } else { 1.0 },
+            levels,
+        }
+    }
+
+    pub(super) fn range_m(&self) -> f64 {
+        self.range_m
+    }
+
+    pub(super) fn local_channels(&self) -> i64 {
+        self.levels.iter().map(|level| level.channels).sum()
+    }
+
+    pub(super) fn cell_channels(&self) -> i64 {
+        self.local_channels() + CONTEXT_M.len() as i64 * self.coarse_channels()
+    }
+
+    pub(super) fn sweep_channels(&self) -> i64 {
+        2 * self.coarse_channels()
+    }
+
+    /// Height and width of the surroundings of a cell, cells of the coarsest level; odd, so that the cell is in the
+    /// centre.
+    pub(super) fn windows(&self) -> impl Iterator<Item = [i64; 2]> + '_ {
+        let cell_m = self.levels.last().map_or([1.0; 2], |level| level.cell_m);
+        let window =
+            move |edge_m: f64| [1, 0].map(|axis| 2 * (edge_m / f64::from(cell_m[axis]) / 2.0).round() as i64 + 1);
+        CONTEXT_M.into_iter().map(window)
+    }
+
+    fn coarse_channels(&self) -> i64 {
+        self.levels.last().map_or(0, |level| level.channels)
+    }
+}
+
+impl LevelGrid {
+    /// Column and row of the cell under a place (metres from the grid's corner); the last where rounding leads beyond.
+    fn cell(&self, [x_m, y_m]: [f32; 2]) -> [usize; 2] {
+        let index = |place_m: f32, edge_m: f32, count: usize| ((place_m / edge_m) as usize).min(count - 1);
+        [index(x_m, self.cell_m[0], self.width), index(y_m, self.cell_m[1], self.height)]
+    }
+}
+
+impl BevCells {
+    /// Sorts points `[N]` of x, y, z (metres, sensor frame) and intensity into cells; those outside the detector's area,
+    /// on the vehicle's own body or not finite are left out.
+    #[must_use]
+    pub fn new(points: &[[f32; 4]], format: &BevFormat) -> Self {
+        let mut cloud = PointCloud::default();
+        format.crop.keep(points, &mut cloud.xyzi);
+        let Some(finest) = format.levels.first() else {
+            return Self { cells: Vec::new(), places: Vec::new(), cloud };
+        };
+        let mut columns = vec![Column::default(); finest.width * finest.height];
+        for &[x, y, z, _] in &cloud.xyzi {
+            let [column, row] = finest.cell([x - format.low_m[0], y * format.y_sign - format.low_m[1]]);
+            columns[row * finest.width + column].add([x, y, z]);
+        }
+        let occupied = columns.iter().enumerate().filter(|(_, column)| column.points > 0);
+        let (numbers, cells): (Vec<usize>, Vec<Cell>) =
+            occupied.map(|(number, column)| (number, column.cell())).unzip();
+        let place = |grid: &LevelGrid| {
+            // Strides are whole numbers: the cells of a level are whole blocks of those of the finest.
+            let steps = [0, 1].map(|axis| (grid.cell_m[axis] / finest.cell_m[axis]).round() as usize);
+            let number = |&number: &usize| {
+                let (column, row) = (number % finest.width / steps[0], number / finest.width / steps[1]);
+                (row * grid.width + column) as i64
+            };
+            numbers.iter().map(number).collect()
+        };
+        Self { cells, places: format.levels.iter().map(place).collect(), cloud }
+    }
+
+    /// The cells, row after row.
+    #[must_use]
+    pub fn cells(&self) -> &[Cell] {
+        &self.cells
+    }
+}
+
+/// Sums over the points of a cell.
+#[derive(Debug, Clone, Copy)]
+struct Column {
+    sum_m: [f32; 3],
+    low_m: f32,
+    high_m: f32,
+    points: u32,
+}
+
+impl Default for Column {
+    fn default() -> Self {
+        Self { sum_m: [0.0; 3], low_m: f32::MAX, high_m: f32::MIN, points: 0 }
+    }
+}
+
+impl Column {
+    fn add(&mut self, point_m: [f32; 3]) {
+        (0..3).for_each(|axis| self.sum_m[axis] += point_m[axis]);
+        self.low_m = self.low_m.min(point_m[2]);
+        self.high_m = self.high_m.max(point_m[2]);
+        self.points += 1;
+    }
+
+    fn cell(&self) -> Cell {
+        let centroid_m = self.sum_m.map(|sum| sum / self.points as f32);
+        Cell { centroid_m, extent_m: self.high_m - self.low_m, points: self.points }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_kept_point_is_in_the_cell_of_its_place_on_every_level() {
+        for y_axis in [YAxis::Left, YAxis::Right] {
+            let config = DetectorConfig { y_axis, ..DetectorConfig::lean() };
+            let format = BevFormat::of_detector(&config);
+            let points = [[5.0, 3.0, -1.0, 0.5], [5.1, 3.1, 0.5, 0.5], [-20.0, -30.0, 0.0, 0.1], [99.0, 0.0, 0.0, 0.0]];
+            let sweep = BevCells::new(&points, &format);
+            let both = sweep.cells().iter().find(|cell| cell.points == 2).unwrap();
+            assert!((both.centroid_m[1] - 3.05).abs() < 1e-5 && (both.extent_m - 1.5).abs() < 1e-6);
+            assert_eq!((sweep.cells().len(), sweep.cloud.xyzi.len()), (2, 3));
+            for (grid, places) in format.levels.iter().zip(&sweep.places) {
+                for (cell, &place) in sweep.cells().iter().zip(places) {
+                    let [x, y, _] = cell.centroid_m;
+                    let [column, row] = grid.cell([x - format.low_m[0], y * format.y_sign - format.low_m[1]]);
+                    assert_eq!(place, (row * grid.width + column) as i64);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn sizes_are_those_of_the_detector() {
+        let format = BevFormat::of_detector(&DetectorConfig::lean());
+        assert_eq!((format.local_channels(), format.cell_channels(), format.sweep_channels()), (224, 480, 256));
+        assert_eq!(format.windows().collect::<Vec<_>>(), [[7, 7], [19, 19]]);
+        assert!((format.range_m() - 64.0).abs() < 0.1);
+    }
+
+    #[test]
+    fn an_empty_sweep_has_no_cells() {
+        let sweep = BevCells::new(&[[f32::NAN; 4]], &BevFormat::of_detector(&DetectorConfig::lean()));
+        assert!(sweep.cells().is_empty() && sweep.places.iter().all(Vec::is_empty));
+    }
+}

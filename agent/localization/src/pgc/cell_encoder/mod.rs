@@ -1,0 +1,247 @@
+//! Encoder of cells: features of the parts of a sweep that scene coordinates are regressed for.
+//!
+//! Two encoders: sparse convolutions that were trained for localization, and the levels of a detector's backbone, which
+//! a vehicle that detects has computed anyway.
+
+mod backbone;
+mod bev_cells;
+
+use std::ops::Range;
+use std::path::Path;
+
+use perception::detector::{BackboneLevel, encoder_sha256};
+use perception::inference::Inference;
+use perception::int8::{ActivationScales, QuantiseError, ScaleSearch};
+use perception::weights::Weights;
+use tch::{Device, Kind};
+
+pub use bev_cells::{BevCells, BevFormat};
+
+use super::encoder_config::SceneEncoderConfig;
+use super::error::LocalizerError;
+use super::scene_encoder::{SceneEncoder, SceneFeatures};
+use super::voxel_batch::VoxelBatch;
+use super::voxelise::{Cell, SweepVoxels};
+use backbone::BackboneEncoder;
+
+/// An encoder and the device that it computes on.
+#[derive(Debug)]
+pub struct CellEncoder {
+    network: Network,
+    format: SweepFormat,
+    device: Device,
+}
+
+#[derive(Debug)]
+enum Network {
+    Sparse(SceneEncoder),
+    Backbone(BackboneEncoder),
+}
+
+/// Parts of a sweep that an encoder takes, and the channels of what it returns.
+#[derive(Debug, Clone, PartialEq)]
+pub enum SweepFormat {
+    /// Voxels of sparse convolutions.
+    Voxels(SceneEncoderConfig),
+    /// BEV cells of a detector.
+    Bev(BevFormat),
+}
+
+/// One sweep, ready for an encoder: everything that needs no tensors.
+#[derive(Debug, Clone)]
+pub enum PreparedSweep {
+    /// For sparse convolutions.
+    Voxels(SweepVoxels),
+    /// For a detector's backbone.
+    Bev(BevCells),
+}
+
+/// Features of some sweeps.
+#[derive(Debug)]
+pub struct EncodedCells {
+    /// Of all cells, sweep after sweep, and of the sweeps.
+    pub features: SceneFeatures,
+    /// Rows of each sweep's cells.
+    pub rows: Vec<Range<i64>>,
+}
+
+impl CellEncoder {
+    /// Reads the encoder of a weights file: a scene encoder, or the one inside a detector. Returns the SHA-256 that a
+    /// head names it by beside it: of the file, or of the detector's encoder, which files of several methods share.
+    ///
+    /// # Errors
+    /// [`LocalizerError`] when the file is missing, truncated or of another kind.
+    pub fn load(path: &Path, inference: Inference) -> Result<(Self, String), LocalizerError> {
+        let Inference { device, precision } = inference;
+        let weights = Weights::load(path)?.with_precision(precision);
+        let sha256 = Self::sha256_of(&weights);
+        if BackboneEncoder::is_in(&weights) {
+            let encoder = BackboneEncoder::of_detector(&weights, device)?;
+            let format = SweepFormat::Bev(encoder.format().clone());
+            return Ok((Self { network: Network::Backbone(encoder), format, device }, sha256));
+        }
+        Ok((Self::sparse(SceneEncoder::from_weights(&weights, device)?, device), sha256))
+    }
+
+    /// SHA-256 that a head names the encoder of a file by, see [`Self::load`].
+    #[must_use]
+    pub fn sha256_of(weights: &Weights) -> String {
+        if BackboneEncoder::is_in(weights) { encoder_sha256(weights) } else { weights.sha256().to_owned() }
+    }
+
+    /// A scene encoder on its device.
+    #[must_use]
+    pub fn sparse(encoder: SceneEncoder, device: Device) -> Self {
+        let format = SweepFormat::Voxels(encoder.config().clone());
+        Self { network: Network::Sparse(encoder), format, device }
+    }
+
+    /// Format of its sweeps.
+    #[must_use]
+    pub fn format(&self) -> &SweepFormat {
+        &self.format
+    }
+
+    /// Features of some sweeps, without gradients; in integers where quantised, otherwise sparse convolutions in `kind`
+    /// and a backbone in single precision.
+    ///
+    /// # Errors
+    /// [`LocalizerError`] when a sweep has another format, or the tensor library fails.
+    pub fn encode(&self, sweeps: &[&PreparedSweep], kind: Kind) -> Result<EncodedCells, LocalizerError> {
+        match &self.network {
+            Network::Sparse(encoder) => {
+                let batch = self.batch(encoder, sweeps)?;
+                let rows = (0..sweeps.len()).map(|sweep| batch.cell_rows(sweep)).collect();
+                Ok(EncodedCells { features: encoder.encode(&batch, kind)?, rows })
+            }
+            Network::Backbone(encoder) => {
+                let cells: Vec<&BevCells> = sweeps.iter().map(|sweep| sweep.bev()).collect::<Result<_, _>>()?;
+                encoder.encode(&cells)
+            }
+        }
+    }
+
+    /// Features of one sweep, as [`Self::encode`] in single precision. A backbone uses `levels`, its own levels for the
+    /// sweep, if they are given.
+    ///
+    /// # Errors
+    /// As [`Self::encode`].
+    pub(super) fn encode_one(
+        &self,
+        sweep: &PreparedSweep,
+        levels: Option<&[BackboneLevel]>,
+    ) -> Result<SceneFeatures, LocalizerError> {
+        match (&self.network, levels) {
+            (Network::Backbone(encoder), Some(levels)) => encoder.features(sweep.bev()?, levels),
+            _ => Ok(self.encode(&[sweep], Kind::Float)?.features),
+        }
+    }
+
+    /// True if it takes the levels of a detector's backbone.
+    #[must_use]
+    pub(super) fn takes_levels(&self) -> bool {
+        matches!(self.network, Network::Backbone(_))
+    }
+
+    /// Computes in integers from here on, if its scales are stored with the head: a detector has its own.
+    ///
+    /// # Errors
+    /// [`QuantiseError`] names the activation whose scale is missing.
+    pub fn quantise(&mut self, scales: &ActivationScales) -> Result<(), QuantiseError> {
+        match &mut self.network {
+            Network::Sparse(encoder) => encoder.quantise(scales),
+            Network::Backbone(_) => Ok(()),
+        }
+    }
+
+    /// Adds the activations that [`Self::quantise`] needs scales of.
+    ///
+    /// # Errors
+    /// As [`Self::encode`].
+    pub fn observe(&self, sweep: &PreparedSweep, search: &mut ScaleSearch) -> Result<(), LocalizerError> {
+        match &self.network {
+            Network::Sparse(encoder) => Ok(encoder.observe(&self.batch(encoder, &[sweep])?, search)?),
+            Network::Backbone(_) => Ok(()),
+        }
+    }
+
+    fn batch(&self, encoder: &SceneEncoder, sweeps: &[&PreparedSweep]) -> Result<VoxelBatch, LocalizerError> {
+        let voxels: Vec<&SweepVoxels> = sweeps.iter().map(|sweep| sweep.voxels()).collect::<Result<_, _>>()?;
+        Ok(VoxelBatch::new(&voxels, encoder.config(), self.device)?)
+    }
+}
+
+impl SweepFormat {
+    /// Prepares points `[N]` of x, y, z (metres, sensor frame) and intensity; those out of range or not finite are left
+    /// out.
+    #[must_use]
+    pub fn prepare(&self, points: &[[f32; 4]]) -> PreparedSweep {
+        match self {
+            Self::Voxels(config) => {
+                PreparedSweep::Voxels(SweepVoxels::new(points.iter().map(|&[x, y, z, _]| [x, y, z]), config))
+            }
+            Self::Bev(format) => PreparedSweep::Bev(BevCells::new(points, format)),
+        }
+    }
+
+    /// Largest horizontal distance of a point that enters the features, metres.
+    #[must_use]
+    pub fn range_m(&self) -> f64 {
+        match self {
+            Self::Voxels(config) => config.range_m,
+            Self::Bev(format) => format.range_m(),
+        }
+    }
+
+    /// Channels of a cell before its surroundings are added.
+    #[must_use]
+    pub fn local_channels(&self) -> i64 {
+        match self {
+            Self::Voxels(config) => config.local_channels(),
+            Self::Bev(format) => format.local_channels(),
+        }
+    }
+
+    /// Channels of a cell.
+    #[must_use]
+    pub fn cell_channels(&self) -> i64 {
+        match self {
+            Self::Voxels(config) => config.cell_channels(),
+            Self::Bev(format) => format.cell_channels(),
+        }
+    }
+
+    /// Channels of a whole sweep.
+    #[must_use]
+    pub fn sweep_channels(&self) -> i64 {
+        match self {
+            Self::Voxels(config) => config.sweep_channels(),
+            Self::Bev(format) => format.sweep_channels(),
+        }
+    }
+}
+
+impl PreparedSweep {
+    /// The cells, in the order of the encoder's rows.
+    #[must_use]
+    pub fn cells(&self) -> &[Cell] {
+        match self {
+            Self::Voxels(voxels) => voxels.cells(),
+            Self::Bev(cells) => cells.cells(),
+        }
+    }
+
+    fn voxels(&self) -> Result<&SweepVoxels, LocalizerError> {
+        match self {
+            Self::Voxels(voxels) => Ok(voxels),
+            Self::Bev(_) => Err(LocalizerError::Config("BEV cells of a detector, must be voxels".into())),
+        }
+    }
+
+    fn bev(&self) -> Result<&BevCells, LocalizerError> {
+        match self {
+            Self::Bev(cells) => Ok(cells),
+            Self::Voxels(_) => Err(LocalizerError::Config("voxels, must be BEV cells of a detector".into())),
+        }
+    }
+}

@@ -1,0 +1,79 @@
+//! Level of a detector's backbone: a feature map before it is up-sampled and reduced.
+
+use tch::{Kind, TchError, Tensor};
+
+use crate::int8::Quantisation;
+
+/// One level for one sweep.
+#[derive(Debug)]
+pub struct BackboneLevel {
+    /// `[1, C, H, W]`, single precision or quantised.
+    values: Tensor,
+    quantisation: Option<Quantisation>,
+}
+
+impl BackboneLevel {
+    /// Levels in single precision.
+    pub(super) fn in_float(maps: Vec<Tensor>) -> Vec<Self> {
+        maps.into_iter().map(|values| Self { values, quantisation: None }).collect()
+    }
+
+    /// A level of quantised values.
+    pub(super) fn in_integers(values: Tensor, quantisation: Quantisation) -> Self {
+        Self { values, quantisation: Some(quantisation) }
+    }
+
+    /// Its values as the next layer takes them.
+    pub(super) fn values(&self) -> &Tensor {
+        &self.values
+    }
+
+    /// `[N, C]` `f32`: the features of some cells `[N]`, numbered row by row, `y * W + x`.
+    ///
+    /// # Errors
+    /// Those of the tensor library.
+    pub fn of_cells(&self, cells: &Tensor) -> Result<Tensor, TchError> {
+        self.in_single_precision(&self.by_cell()?.f_index_select(0, cells)?)
+    }
+
+    /// `[1, C, H, W]` `f32`: the whole map.
+    ///
+    /// # Errors
+    /// Those of the tensor library.
+    pub fn map(&self) -> Result<Tensor, TchError> {
+        self.in_single_precision(&self.values)
+    }
+
+    /// `[H * W, C]`: a view if channels are innermost in memory.
+    fn by_cell(&self) -> Result<Tensor, TchError> {
+        let channels = self.values.size()[1];
+        self.values.f_permute([0, 2, 3, 1])?.f_reshape([-1, channels])
+    }
+
+    fn in_single_precision(&self, values: &Tensor) -> Result<Tensor, TchError> {
+        let values = values.f_to_kind(Kind::Float)?;
+        let Some(Quantisation { scale, zero_point }) = self.quantisation else { return Ok(values) };
+        values.f_sub_scalar(i64::from(zero_point))?.f_mul_scalar(scale.step())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use tch::Device;
+
+    use super::*;
+    use crate::int8::Scale;
+
+    #[test]
+    fn cells_have_the_features_of_their_place_in_both_formats() {
+        let map = Tensor::arange(2 * 3 * 4, (Kind::Float, Device::Cpu)).view([1, 2, 3, 4]);
+        let quantisation = Quantisation { scale: Scale::of_exponent(-1), zero_point: 4 };
+        let quantised = BackboneLevel::in_integers(quantisation.quantise(&map).unwrap(), quantisation);
+        let cells = Tensor::from_slice(&[5_i64, 0]);
+        for level in [&BackboneLevel::in_float(vec![map.shallow_clone()])[0], &quantised] {
+            let expected = Tensor::from_slice2(&[[5.0_f32, 17.0], [0.0, 12.0]]);
+            assert_eq!(level.of_cells(&cells).unwrap(), expected);
+            assert_eq!(level.map().unwrap(), map);
+        }
+    }
+}
