@@ -7,4 +7,5 @@ mod localization;
 mod pace;
 mod processes;
 mod ros2_clients;
+mod shared_encoder;
 mod simulation_time;
