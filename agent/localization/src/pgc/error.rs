@@ -37,8 +37,14 @@ pub enum LocalizerError {
     },
     /// The detector whose encoder is used failed.
     #[error(transparent)]
-    Detector(#[from] DetectorError),
+    Detector(Box<DetectorError>),
     /// The tensor library failed.
     #[error("tensor library: {}", first_line(.0))]
     Tensor(#[from] TchError),
+}
+
+impl From<DetectorError> for LocalizerError {
+    fn from(error: DetectorError) -> Self {
+        Self::Detector(Box::new(error))
+    }
 }

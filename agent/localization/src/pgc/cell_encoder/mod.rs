@@ -34,8 +34,8 @@ pub struct CellEncoder {
 
 #[derive(Debug)]
 enum Network {
-    Sparse(SceneEncoder),
-    Backbone(BackboneEncoder),
+    Sparse(Box<SceneEncoder>),
+    Backbone(Box<BackboneEncoder>),
 }
 
 /// Parts of a sweep that an encoder takes, and the channels of what it returns.
@@ -76,7 +76,7 @@ impl CellEncoder {
         let weights = Weights::load(path)?.with_precision(precision);
         let sha256 = Self::sha256_of(&weights);
         if BackboneEncoder::is_in(&weights) {
-            let encoder = BackboneEncoder::of_detector(&weights, device)?;
+            let encoder = Box::new(BackboneEncoder::of_detector(&weights, device)?);
             let format = SweepFormat::Bev(encoder.format().clone());
             return Ok((Self { network: Network::Backbone(encoder), format, device }, sha256));
         }
@@ -93,7 +93,7 @@ impl CellEncoder {
     #[must_use]
     pub fn sparse(encoder: SceneEncoder, device: Device) -> Self {
         let format = SweepFormat::Voxels(encoder.config().clone());
-        Self { network: Network::Sparse(encoder), format, device }
+        Self { network: Network::Sparse(Box::new(encoder)), format, device }
     }
 
     /// Format of its sweeps.
