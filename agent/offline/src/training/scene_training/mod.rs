@@ -128,7 +128,10 @@ impl<'a> Training<'a> {
         let stored = config.init.as_ref().map(|init| StoredHead::load(init, &config.encoder, &features.encoder_sha256));
         let stored = stored.transpose()?;
         let head_config = match &stored {
-            Some(stored) => stored.config.clone(),
+            Some(stored) => {
+                let counted = stored.config.sweep_points.or_else(|| median_points(&features.training.points));
+                SceneHeadConfig { sweep_points: counted, ..stored.config.clone() }
+            }
             None => head_config(config, &features)?,
         };
         let Features { training: mut cache, validation, data, .. } = features;
