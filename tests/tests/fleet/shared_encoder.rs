@@ -8,6 +8,8 @@ use dataset::LoadOptions;
 use localization::pose_source::{PgcConfig, PoseInput, PoseSourceConfig};
 use perception::detector::Detector;
 use perception::inference::Inference;
+use perception::int8::InferencePrecision;
+use perception::weights::Weights;
 use protocol::{EgoMotion, PoseEstimate};
 use tch::Device;
 use tests::fleet::programs;
@@ -49,6 +51,9 @@ fn a_vehicle_localizes_with_the_levels_that_its_detector_has_computed() {
     let detector = || Detector::load(&released("lean-pastat"), Device::Cpu).unwrap();
     let mut shares = Agent::new(cav.clone(), pgc("lean-pastat").build(Inference::default()).unwrap(), detector());
     let mut of_max = Agent::new(cav.clone(), with_others_scales.unwrap(), detector());
+    let weights = Weights::load(&released("lean-pastat")).unwrap().with_precision(InferencePrecision::Float);
+    let float = Detector::from_weights(&weights, &weights.detector_config().unwrap(), Device::Cpu).unwrap();
+    let mut in_float = Agent::new(cav.clone(), pgc("lean-pastat").build(Inference::FLOAT).unwrap(), float);
     for tick in 0..scenario.ticks.len() {
         let frame = scenario.load(0, tick, &LoadOptions::default()).unwrap();
         let (capture_nanos, cloud, motion) = (frame.capture_nanos, &frame.points, EgoMotion::default());
@@ -56,6 +61,8 @@ fn a_vehicle_localizes_with_the_levels_that_its_detector_has_computed() {
             alone.estimate(&PoseInput { cav: &cav, capture_nanos, cloud, levels: None, measured: None, motion });
         let input = AgentInput { capture_nanos, cloud, measured_pose: None, motion };
         assert_eq!(shares.process(&input).unwrap().pose, expected, "the same bits");
+        // The head was trained on 8-bit levels: those of a detector in floating point are not used.
+        assert!(distance_m(&in_float.process(&input).unwrap().pose, &expected) < 0.1);
         assert!(distance_m(&of_max.process(&input).unwrap().pose, &expected) < 0.5);
         let truth = PoseEstimate::new(frame.world_from_lidar.unwrap(), 1.0);
         assert!(distance_m(&expected, &truth) < 1.0, "{expected:?}");

@@ -174,7 +174,7 @@ impl Localizer {
 
     fn open(encoder: &Path, head: &Path, inference: Inference) -> Result<(Self, Weights), LocalizerError> {
         let Inference { device, precision } = inference;
-        let (mut network, encoder_sha256) = CellEncoder::load(encoder, inference)?;
+        let (mut network, encoder_sha256) = CellEncoder::load(encoder, device)?;
         let weights = Weights::load(head)?.with_precision(precision);
         weights.check_kind(SceneHead::KIND)?;
         let config: SceneHeadConfig = weights.config()?;

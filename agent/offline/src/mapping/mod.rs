@@ -262,8 +262,7 @@ impl Map<'_> {
             ));
             return Ok(plan);
         }
-        let (encoder, _) =
-            CellEncoder::load(&self.config.encoder, Inference { device: run.device, ..Inference::default() })?;
+        let (encoder, _) = CellEncoder::load(&self.config.encoder, run.device)?;
         let wanted = self.config.most_sweeps.unwrap_or(usize::MAX).min(sweeps.training.len());
         let probes = Arc::new(sweeps.list.subset(&thinned(&sweeps.training, PROBES)));
         let unchanged = SweepAugmentation { copies: 1, turn_rad: 0.0, keep: 1.0 };

@@ -28,6 +28,12 @@ impl BackboneLevel {
         &self.values
     }
 
+    /// True if it was computed in 8-bit integers.
+    #[must_use]
+    pub fn is_quantised(&self) -> bool {
+        self.quantisation.is_some()
+    }
+
     /// `[N, C]` `f32`: the features of some cells `[N]`, numbered row by row, `y * W + x`.
     ///
     /// # Errors

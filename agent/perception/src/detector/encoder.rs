@@ -53,6 +53,11 @@ impl BevEncoder {
         Ok(Self { layers, ..self })
     }
 
+    /// True if its layers are in integers.
+    pub(super) fn is_quantised(&self) -> bool {
+        matches!(self.layers, Layers::Int8 { .. })
+    }
+
     /// Writes pillars to the canvas.
     pub(super) fn scatter(&mut self, pillars: &Pillars) -> Result<Canvas, TchError> {
         let Self { pillar_grid, projection, device, layers } = self;

@@ -129,6 +129,12 @@ impl Detector {
         self.device
     }
 
+    /// True if it computes in 8-bit integers.
+    #[must_use]
+    pub fn is_quantised(&self) -> bool {
+        self.encoder.is_quantised()
+    }
+
     /// SHA-256 of its weights file; empty if it was not read from one.
     #[must_use]
     pub fn sha256(&self) -> &str {

@@ -16,7 +16,9 @@ use crate::pgc::scene_encoder::SceneFeatures;
 pub(super) struct BackboneEncoder {
     /// Reuses its buffers from sweep to sweep.
     detector: Mutex<Detector>,
+    is_quantised: bool,
     format: BevFormat,
+    /// Of the features.
     device: Device,
 }
 
@@ -29,13 +31,19 @@ impl BackboneEncoder {
     /// The encoder of a detector's weights.
     pub(super) fn of_detector(weights: &Weights, device: Device) -> Result<Self, LocalizerError> {
         let config = weights.detector_config()?;
-        let detector = Detector::from_weights(weights, &config, device)?;
-        Ok(Self { format: BevFormat::of_detector(&config), detector: Mutex::new(detector), device })
+        let detector = Detector::from_weights(weights, &config, Device::Cpu)?;
+        let (format, is_quantised) = (BevFormat::of_detector(&config), detector.is_quantised());
+        Ok(Self { detector: Mutex::new(detector), is_quantised, format, device })
     }
 
     /// Grids of its levels.
     pub(super) fn format(&self) -> &BevFormat {
         &self.format
+    }
+
+    /// True for levels in the number format of its own.
+    pub(super) fn takes(&self, levels: &[BackboneLevel]) -> bool {
+        levels.iter().all(|level| level.is_quantised() == self.is_quantised)
     }
 
     /// Features of some sweeps, one after another.
@@ -60,10 +68,11 @@ impl BackboneEncoder {
             return Err(LocalizerError::Config("a backbone without levels".into()));
         };
         Ok(no_grad(|| {
-            let index = |places: &[i64]| Tensor::f_from_slice(places)?.f_to_device(self.device);
+            let map = coarsest.map()?;
+            let index = |places: &[i64]| Tensor::f_from_slice(places)?.f_to_device(map.device());
             let own = levels.iter().zip(&sweep.places).map(|(level, places)| level.of_cells(&index(places)?));
             let mut parts: Vec<Tensor> = own.collect::<Result<_, _>>()?;
-            let (map, places) = (coarsest.map()?, index(places)?);
+            let places = index(places)?;
             let channels = map.size()[1];
             for window in self.format.windows() {
                 let means = mean_over(&map, window)?.f_permute([0, 2, 3, 1])?.f_reshape([-1, channels])?;
@@ -71,7 +80,8 @@ impl BackboneEncoder {
             }
             let mean = map.f_mean_dim([2_i64, 3].as_slice(), false, Kind::Float)?;
             let sweeps = Tensor::f_cat(&[mean, map.f_amax([2_i64, 3].as_slice(), false)?], 1)?;
-            Ok::<_, TchError>(SceneFeatures { cells: Tensor::f_cat(&parts, 1)?, sweeps })
+            let cells = Tensor::f_cat(&parts, 1)?.f_to_device(self.device)?;
+            Ok::<_, TchError>(SceneFeatures { cells, sweeps: sweeps.f_to_device(self.device)? })
         })?)
     }
 }
@@ -91,7 +101,6 @@ mod tests {
     use std::path::{Path, PathBuf};
 
     use perception::detector::encoder_sha256;
-    use perception::inference::Inference;
     use perception::model_config::DetectorConfig;
     use perception::pillars::point_pillars::PointPillars;
     use perception::weights::{CONFIG_KEY, Precision, save};
@@ -124,7 +133,7 @@ mod tests {
     fn given_levels_have_the_features_that_the_encoder_computes_itself() {
         let folder = tempfile::tempdir().unwrap();
         let path = detector(folder.path(), 0.0);
-        let (encoder, sha256) = CellEncoder::load(&path, Inference::default()).unwrap();
+        let (encoder, sha256) = CellEncoder::load(&path, Device::Cpu).unwrap();
         let mut of_vehicle = Detector::load(&path, Device::Cpu).unwrap();
         assert_eq!(sha256, of_vehicle.encoder_sha256());
         let clouds = [cloud(0.0), cloud(1.3)];
@@ -145,7 +154,7 @@ mod tests {
     #[test]
     fn an_empty_sweep_has_no_cells_but_features() {
         let folder = tempfile::tempdir().unwrap();
-        let (encoder, _) = CellEncoder::load(&detector(folder.path(), 0.0), Inference::default()).unwrap();
+        let (encoder, _) = CellEncoder::load(&detector(folder.path(), 0.0), Device::Cpu).unwrap();
         let encoded = encoder.encode(&[&encoder.format().prepare(&[])], Kind::Float).unwrap();
         assert_eq!(encoded.features.cells.size(), [0, encoder.format().cell_channels()]);
         assert_eq!((encoded.rows.len(), encoded.rows[0].clone()), (1, 0..0));
@@ -166,7 +175,7 @@ mod tests {
         let path = folder.path().join("head.safetensors");
         let metadata: BTreeMap<_, _> = [(KIND_KEY.to_owned(), "scene head".to_owned())].into();
         save(&path, &VarStore::new(Device::Cpu), &metadata, Precision::Single).unwrap();
-        let message = CellEncoder::load(&path, Inference::default()).unwrap_err().to_string();
+        let message = CellEncoder::load(&path, Device::Cpu).unwrap_err().to_string();
         assert!(message.contains("scene head") && message.contains(SceneEncoder::KIND), "{message}");
     }
 }

@@ -10,7 +10,6 @@ use std::ops::Range;
 use std::path::Path;
 
 use perception::detector::{BackboneLevel, encoder_sha256};
-use perception::inference::Inference;
 use perception::int8::{ActivationScales, QuantiseError, ScaleSearch};
 use perception::weights::Weights;
 use tch::{Device, Kind};
@@ -69,11 +68,13 @@ impl CellEncoder {
     /// Reads the encoder of a weights file: a scene encoder, or the one inside a detector. Returns the SHA-256 that a
     /// head names it by beside it: of the file, or of the detector's encoder, which files of several methods share.
     ///
+    /// A detector's backbone always computes in the number format of its file, on the CPU, as for the training of the
+    /// head: the levels of another format are others.
+    ///
     /// # Errors
     /// [`LocalizerError`] when the file is missing, truncated or of another kind.
-    pub fn load(path: &Path, inference: Inference) -> Result<(Self, String), LocalizerError> {
-        let Inference { device, precision } = inference;
-        let weights = Weights::load(path)?.with_precision(precision);
+    pub fn load(path: &Path, device: Device) -> Result<(Self, String), LocalizerError> {
+        let weights = Weights::load(path)?;
         let sha256 = Self::sha256_of(&weights);
         if BackboneEncoder::is_in(&weights) {
             let encoder = Box::new(BackboneEncoder::of_detector(&weights, device)?);
@@ -121,8 +122,8 @@ impl CellEncoder {
         }
     }
 
-    /// Features of one sweep, as [`Self::encode`] in single precision. A backbone uses `levels`, its own levels for the
-    /// sweep, if they are given.
+    /// Features of one sweep, as [`Self::encode`] in single precision. A backbone uses `levels`, those of the sweep, if
+    /// they are given in its number format.
     ///
     /// # Errors
     /// As [`Self::encode`].
@@ -132,7 +133,9 @@ impl CellEncoder {
         levels: Option<&[BackboneLevel]>,
     ) -> Result<SceneFeatures, LocalizerError> {
         match (&self.network, levels) {
-            (Network::Backbone(encoder), Some(levels)) => encoder.features(sweep.bev()?, levels),
+            (Network::Backbone(encoder), Some(levels)) if encoder.takes(levels) => {
+                encoder.features(sweep.bev()?, levels)
+            }
             _ => Ok(self.encode(&[sweep], Kind::Float)?.features),
         }
     }

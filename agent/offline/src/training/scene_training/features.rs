@@ -5,7 +5,6 @@ use std::sync::Arc;
 use super::config::{SceneReport, SceneTrainConfig};
 use crate::training::{FeatureCache, LocalizerTrainError, SweepAugmentation, SweepList};
 use localization::pgc::{CellEncoder, SweepFormat};
-use perception::inference::Inference;
 use perception::train::DataListing;
 
 /// Sweeps of a scene.
@@ -33,8 +32,7 @@ impl Features {
         sweeps: &SceneSweeps,
         observe: &mut dyn FnMut(&SceneReport),
     ) -> Result<Self, LocalizerTrainError> {
-        let (encoder, encoder_sha256) =
-            CellEncoder::load(&config.encoder, Inference { device: config.run.device, ..Inference::default() })?;
+        let (encoder, encoder_sha256) = CellEncoder::load(&config.encoder, config.run.device)?;
         let mut encode = |list: &Arc<SweepList>, augmentation| {
             let mut progress = |done, total| observe(&SceneReport::Encoding(done, total));
             let cache = FeatureCache::build(list, &encoder, augmentation, &config.run, &mut progress)?;
