@@ -110,18 +110,26 @@ mod tests {
     use super::*;
     use crate::pgc::{CellEncoder, SceneEncoder};
 
-    /// Weights of a small detector; its head is another for another `head`, its encoder the same.
-    fn detector(folder: &Path, head: f64) -> PathBuf {
+    /// Weights of a small detector.
+    fn detector(folder: &Path) -> PathBuf {
+        let [path, _] = detectors(folder);
+        path
+    }
+
+    /// Weights of two small detectors with one encoder and different heads.
+    fn detectors(folder: &Path) -> [PathBuf; 2] {
         tch::set_num_threads(1);
         tch::manual_seed(3);
         let config = DetectorConfig { lidar_range_m: [-12.8, -6.4, -3.0, 12.8, 6.4, 1.0], ..DetectorConfig::lean() };
         let network = VarStore::new(Device::Cpu);
         PointPillars::new(&network.root(), &config).unwrap();
-        let _ = no_grad(|| network.variables()["cls_head.bias"].shallow_clone().fill_(head));
-        let path = folder.join(format!("detector-{head}.safetensors"));
         let metadata: BTreeMap<_, _> = [(CONFIG_KEY.to_owned(), serde_json::to_string(&config).unwrap())].into();
-        save(&path, &network, &metadata, Precision::Single).unwrap();
-        path
+        [0.0, 1.0].map(|bias| {
+            let _ = no_grad(|| network.variables()["cls_head.bias"].shallow_clone().fill_(bias));
+            let path = folder.join(format!("detector-{bias}.safetensors"));
+            save(&path, &network, &metadata, Precision::Single).unwrap();
+            path
+        })
     }
 
     fn cloud(shift: f32) -> PointCloud {
@@ -132,7 +140,7 @@ mod tests {
     #[test]
     fn given_levels_have_the_features_that_the_encoder_computes_itself() {
         let folder = tempfile::tempdir().unwrap();
-        let path = detector(folder.path(), 0.0);
+        let path = detector(folder.path());
         let (encoder, sha256) = CellEncoder::load(&path, Device::Cpu).unwrap();
         let mut of_vehicle = Detector::load(&path, Device::Cpu).unwrap();
         assert_eq!(sha256, of_vehicle.encoder_sha256());
@@ -154,7 +162,7 @@ mod tests {
     #[test]
     fn an_empty_sweep_has_no_cells_but_features() {
         let folder = tempfile::tempdir().unwrap();
-        let (encoder, _) = CellEncoder::load(&detector(folder.path(), 0.0), Device::Cpu).unwrap();
+        let (encoder, _) = CellEncoder::load(&detector(folder.path()), Device::Cpu).unwrap();
         let encoded = encoder.encode(&[&encoder.format().prepare(&[])], Kind::Float).unwrap();
         assert_eq!(encoded.features.cells.size(), [0, encoder.format().cell_channels()]);
         assert_eq!((encoded.rows.len(), encoded.rows[0].clone()), (1, 0..0));
@@ -163,7 +171,7 @@ mod tests {
     #[test]
     fn detectors_that_share_an_encoder_have_one_digest() {
         let folder = tempfile::tempdir().unwrap();
-        let [one, other] = [0.0, 1.0].map(|head| Weights::load(&detector(folder.path(), head)).unwrap());
+        let [one, other] = detectors(folder.path()).map(|path| Weights::load(&path).unwrap());
         assert_ne!(one.sha256(), other.sha256());
         assert_eq!(CellEncoder::sha256_of(&one), CellEncoder::sha256_of(&other));
         assert_eq!(CellEncoder::sha256_of(&one), encoder_sha256(&one));
