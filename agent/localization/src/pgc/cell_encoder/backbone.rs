@@ -41,9 +41,10 @@ impl BackboneEncoder {
         &self.format
     }
 
-    /// True for levels in the number format of its own.
+    /// True for levels in the number format of its own and on the same grids: the same weights may have another area.
     pub(super) fn takes(&self, levels: &[BackboneLevel]) -> bool {
         levels.iter().all(|level| level.is_quantised() == self.is_quantised)
+            && levels.iter().map(BackboneLevel::shape).eq(self.format.shapes())
     }
 
     /// Features of some sweeps, one after another.
@@ -157,6 +158,21 @@ mod tests {
             assert!(given.cells.equal(&both.features.cells.narrow(0, rows.start, rows.end - rows.start)));
             assert!(given.sweeps.equal(&both.features.sweeps.narrow(0, number as i64, 1)));
         }
+    }
+
+    #[test]
+    fn levels_of_another_area_are_not_used() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = detector(folder.path());
+        let (encoder, _) = CellEncoder::load(&path, Device::Cpu).unwrap();
+        let weights = Weights::load(&path).unwrap();
+        let larger =
+            DetectorConfig { lidar_range_m: [-25.6, -6.4, -3.0, 25.6, 6.4, 1.0], ..weights.detector_config().unwrap() };
+        let mut of_vehicle = Detector::from_weights(&weights, &larger, Device::Cpu).unwrap();
+        let levels = of_vehicle.encode(&cloud(0.0)).unwrap().levels;
+        let sweep = encoder.format().prepare(&cloud(0.0).xyzi);
+        let own = encoder.encode_one(&sweep, None).unwrap();
+        assert!(encoder.encode_one(&sweep, Some(&levels)).unwrap().cells.equal(&own.cells));
     }
 
     #[test]

@@ -84,6 +84,11 @@ impl BevFormat {
         2 * self.coarse_channels()
     }
 
+    /// Channels, height and width of each level.
+    pub(super) fn shapes(&self) -> impl Iterator<Item = [i64; 3]> + '_ {
+        self.levels.iter().map(|level| [level.channels, level.height as i64, level.width as i64])
+    }
+
     /// Height and width of the surroundings of a cell, cells of the coarsest level; odd, so that the cell is in the
     /// centre.
     pub(super) fn windows(&self) -> impl Iterator<Item = [i64; 2]> + '_ {
