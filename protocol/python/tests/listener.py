@@ -60,8 +60,8 @@ def test_what_is_not_there_is_named(run):
 def test_a_certificate_permits_its_streams(run):
     keys, endpoint = run.work / "keys", free_endpoint().replace("tcp/", "quic/")
     call("v2vloc", "keys", "--out", keys, "--agents", "1000", "--egos", "1000", "--hosts", "127.0.0.1")
-    refuses(lambda: v2vloc.listen(endpoint, run="secure", credentials=keys / "viewer", streams=["bev"]),
-            "a certificate of viewer does not permit \"bev\"")
+    refuses(lambda: v2vloc.listen(endpoint, run="secure", credentials=keys / "viewer", streams=["lidar"]),
+            "a certificate of viewer does not permit \"lidar\"")
     with background("v2vloc", "router", "--listen", endpoint, "--keys", keys / "router"):
         listener = v2vloc.listen(endpoint, run="secure", credentials=keys / "recorder", timeout_s=30)
         call("sim-replay", "stream", run.scene, "--run", "secure", "--connect", endpoint, "--keys", keys / "replay",
