@@ -10,7 +10,7 @@ use tch::{Device, Kind, TchError, Tensor, no_grad};
 
 use super::error::LocalizerTrainError;
 use super::sweep_store::{SweepList, yaw};
-use super::turned_sweep::{CELLS, PosedSweep, TurnedSweep};
+use super::turned_sweep::{CELLS, TurnedSweep};
 use localization::pgc::{Cell, CellEncoder, PreparedSweep};
 use perception::train::{Prefetch, RunConfig};
 
@@ -70,7 +70,7 @@ impl FeatureCache {
             let numbers = (batch * BATCH..(batch + 1) * BATCH).filter(|&number| (number as usize) < total);
             let prepared = numbers.map(|number| {
                 let (index, copy) = (number as usize % source.len(), number as usize / source.len());
-                let (frame, world_from_sensor) = source.posed_frame(index)?;
+                let sweep = source.posed_sweep(index, format.range_m())?;
                 let mut rng = ChaCha8Rng::seed_from_u64(seed);
                 rng.set_stream(number);
                 let (turn, keep) = match copy {
@@ -80,7 +80,6 @@ impl FeatureCache {
                         (yaw(rng.random_range(-angle..angle)), rng.random_range(augmentation.keep..=1.0))
                     }
                 };
-                let sweep = PosedSweep { points: frame.points.xyzi, world_from_sensor };
                 Some(TurnedSweep::new(sweep, &turn, keep, &mut rng, &format))
             });
             prepared.flatten().collect()

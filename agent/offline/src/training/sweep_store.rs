@@ -58,6 +58,13 @@ impl StoredSweep {
     }
 }
 
+/// A sweep with its true pose.
+pub(super) struct PosedSweep {
+    /// `[N]` of x, y, z (metres, sensor frame) and intensity.
+    pub(super) points: Vec<[f32; 4]>,
+    pub(super) world_from_sensor: Isometry3<f64>,
+}
+
 /// A rotation about the vertical.
 #[must_use]
 pub(crate) fn yaw(angle_rad: f64) -> Isometry3<f64> {
@@ -192,10 +199,16 @@ impl SweepList {
     /// is counted.
     pub(crate) fn read(&self, index: usize, range_m: f64) -> Option<StoredSweep> {
         let Place { world, drive, .. } = self.places[index];
-        let (mut frame, pose) = self.posed_frame(index)?;
-        let range = range_m as f32;
-        frame.points.xyzi.retain(|[x, y, z, _]| x * x + y * y <= range * range && z.is_finite());
-        Some(StoredSweep::new(world, drive, pose, &frame.points.xyzi))
+        let PosedSweep { points, world_from_sensor } = self.posed_sweep(index, range_m)?;
+        Some(StoredSweep::new(world, drive, world_from_sensor, &points))
+    }
+
+    /// The same with the values of the file.
+    pub(super) fn posed_sweep(&self, index: usize, range_m: f64) -> Option<PosedSweep> {
+        let (frame, world_from_sensor) = self.posed_frame(index)?;
+        let (mut points, range) = (frame.points.xyzi, range_m as f32);
+        points.retain(|[x, y, z, _]| x * x + y * y <= range * range && z.is_finite());
+        Some(PosedSweep { points, world_from_sensor })
     }
 
     /// Reads the whole frame of a sweep with the pose of its sensor; `None` if that is unknown or the frame cannot be

@@ -4,17 +4,11 @@ use nalgebra::{Isometry3, Point3};
 use rand::Rng;
 
 use super::pairs::choose;
+use super::sweep_store::PosedSweep;
 use localization::pgc::{PreparedSweep, SweepFormat};
 
 /// Number of cells of a sweep that are training examples.
 pub(crate) const CELLS: usize = 400;
-
-/// A sweep with its true pose.
-pub(super) struct PosedSweep {
-    /// `[N]` of x, y, z (metres, sensor frame) and intensity.
-    pub(super) points: Vec<[f32; 4]>,
-    pub(super) world_from_sensor: Isometry3<f64>,
-}
 
 /// A sweep, rotated and subsampled.
 pub(super) struct TurnedSweep {
@@ -28,7 +22,8 @@ pub(super) struct TurnedSweep {
 }
 
 impl TurnedSweep {
-    /// The sweep of a sensor in the orientation `turned_from_sensor`, each point kept with a probability.
+    /// A sweep within the range of the encoder, for a sensor in the orientation `turned_from_sensor`, each point kept with
+    /// a probability.
     pub(super) fn new(
         sweep: PosedSweep,
         turned_from_sensor: &Isometry3<f64>,
@@ -37,8 +32,6 @@ impl TurnedSweep {
         format: &SweepFormat,
     ) -> Self {
         let PosedSweep { mut points, world_from_sensor } = sweep;
-        let range_m = format.range_m() as f32;
-        points.retain(|[x, y, z, _]| x * x + y * y <= range_m * range_m && z.is_finite());
         let in_range = points.len();
         points.retain(|_| keep >= 1.0 || rng.random_bool(keep));
         let turn: Isometry3<f32> = turned_from_sensor.cast();
