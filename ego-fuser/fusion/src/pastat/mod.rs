@@ -11,7 +11,6 @@ mod config;
 mod decoder;
 mod extensions;
 mod patches;
-mod precision;
 mod spatial_alignment;
 mod temporal_encoding;
 mod transformer;

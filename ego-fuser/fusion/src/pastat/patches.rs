@@ -1,10 +1,9 @@
 //! Patch embedding (the Flatten of Eq. 10): squares of cells to tokens.
 
-use tch::{Kind, TchError, Tensor, nn};
+use tch::{TchError, Tensor, nn};
 
 use super::coarse_alignment::CoarseMaps;
 use super::config::PastatConfig;
-use super::precision::fastest_of;
 use crate::warp::WarpedMaps;
 
 /// Linear embedding of patches of cells.
@@ -53,10 +52,7 @@ impl Patches {
             _ => ws.f_avg_pool2d([cells, cells], [cells, cells], [0_i64, 0], false, true, None::<i64>)?,
         };
         let weight = weight * (cells * cells) as f64;
-        let kind = fastest_of(maps);
-        let bias = bs.as_ref().map(|bias| bias.f_to_kind(kind)).transpose()?;
-        let (maps, weight) = (maps.f_to_kind(kind)?, weight.f_to_kind(kind)?);
-        maps.f_conv2d(&weight, bias.as_ref(), [edge, edge], [0, 0], [1, 1], 1)?.f_to_kind(Kind::Float)
+        maps.f_conv2d(&weight, bs.as_ref(), [edge, edge], [0, 0], [1, 1], 1)
     }
 
     /// `[N, h, w]`: 1 for tokens of which any cell is valid in the mask `[N, 1, H, W]`, whose cells are pooled from

@@ -19,7 +19,6 @@ use crate::maps::AlignedMaps;
 use crate::pastat::coarse_alignment::{CoarseMaps, Origins};
 use crate::pastat::config::{MemoryConfig, PastatConfig};
 use crate::pastat::patches::channels_last;
-use crate::pastat::precision::fastest_of;
 use crate::pastat::spatial_alignment::FineMaps;
 use crate::pastat::spatial_alignment::area::moved;
 
@@ -227,7 +226,7 @@ impl Around {
     }
 }
 
-/// A 3x3 convolution at some cells, in the fastest precision: `[P, hidden]` of the features `[R, C]` that are shown.
+/// A 3x3 convolution at some cells: `[P, hidden]` of the features `[R, C]` that are shown.
 ///
 /// Each cell is multiplied with all nine weights first: the nine results that a cell needs are fewer numbers than the
 /// features of nine cells.
@@ -236,10 +235,10 @@ fn beside(
     shown: &Tensor,
     Around { results: rows, first }: &Around,
 ) -> Result<Tensor, TchError> {
-    let (hidden, kind) = (convolution.ws.size4()?.0, fastest_of(shown));
-    let weight = convolution.ws.f_permute([2, 3, 0, 1])?.f_flatten(0, 2)?.f_to_kind(kind)?;
-    let shown = shown.f_to_kind(kind)?.f_constant_pad_nd([0, 0, 0, 1])?;
-    let results = shown.f_linear(&weight, None::<&Tensor>)?.f_to_kind(Kind::Float)?.f_view([-1, hidden])?;
+    let hidden = convolution.ws.size4()?.0;
+    let weight = convolution.ws.f_permute([2, 3, 0, 1])?.f_flatten(0, 2)?;
+    let shown = shown.f_constant_pad_nd([0, 0, 0, 1])?;
+    let results = shown.f_linear(&weight, None::<&Tensor>)?.f_view([-1, hidden])?;
     let (sums, ..) = Tensor::f_embedding_bag(&results, rows, first, false, SUM, false, None::<&Tensor>, false)?;
     match &convolution.bs {
         Some(bias) => sums.f_add(bias),
@@ -269,7 +268,7 @@ mod tests {
         let shown = map.flatten(2, 3).squeeze_dim(0).transpose(0, 1).index_select(0, &of(&near));
         let some =
             beside(&convolution, &shown, &Around::of(&of(&selection.around).view([-1, AROUND])).unwrap()).unwrap();
-        assert!(some.allclose(&all.index_select(0, &of(&selection.cells)), 1e-2, 1e-2, false));
+        assert!(some.allclose(&all.index_select(0, &of(&selection.cells)), 1e-5, 1e-5, false));
     }
 
     /// The blend equals that of all cells where a vehicle is likely; elsewhere the newest map is unchanged.
