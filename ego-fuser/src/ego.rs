@@ -12,7 +12,7 @@ use nalgebra::Isometry3;
 use perception::boxes::decode::Decoded;
 use perception::boxes::postprocess::{AgentBoxes, PostprocessConfig, postprocess};
 use perception::detector::Detector;
-use perception::weights::Weights;
+use perception::weights::{METHOD_KEY, Weights};
 use protocol::{CavId, DecodedFeatures, Detection, DropReason, PointCloud, Pose, PoseEstimate, StageTiming};
 use support::stage_times::StageTimes;
 use tch::{Device, Kind, TchError, Tensor, no_grad};
@@ -21,7 +21,7 @@ use crate::misbehaviour::{Assessment, MisbehaviourConfig, MisbehaviourDetector};
 use fusion::f64_tensor;
 use fusion::history::{History, KeptMap};
 use fusion::method::{Exchange, Method};
-use fusion::model::{FusionStage, METHOD_KEY, StageError};
+use fusion::model::{FusionStage, StageError};
 use fusion::points::merge_points;
 use fusion::{AlignedMaps, MapMetadata, ReceivedMaps};
 

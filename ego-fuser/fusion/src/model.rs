@@ -14,7 +14,7 @@ use perception::model_config::{ConfigError, DetectorConfig, YAxis};
 use perception::pillars::batch::PillarBatch;
 use perception::pillars::point_pillars::PointPillars;
 use perception::train::ComputePrecision;
-use perception::weights::{CONFIG_KEY, Weights, WeightsError};
+use perception::weights::{CONFIG_KEY, METHOD_KEY, Weights, WeightsError};
 use protocol::{Box3d, Detection};
 use tch::nn::VarStore;
 use tch::{Device, Kind, TchError, Tensor};
@@ -28,9 +28,6 @@ use crate::{AlignedMaps, FUSION_KEY, FusionConfig, FusionOutput, MapMetadata, Re
 
 use stage::{FUSION_PREFIX, stored_config};
 pub use stage::{FusionStage, StageError};
-
-/// Metadata key of the method that weights were trained with.
-pub const METHOD_KEY: &str = "method";
 
 /// Error of building, loading or running a model.
 #[derive(Debug, thiserror::Error)]

@@ -7,7 +7,7 @@ use std::f64::consts::TAU;
 
 use dataset::{LoadOptions, ReadError, Scenario};
 use perception::detector::Detector;
-use perception::weights::Weights;
+use perception::weights::{METHOD_KEY, Weights};
 use protocol::{PointCloud, Pose};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -17,7 +17,7 @@ use tch::{Device, Kind, Tensor, no_grad};
 
 use ego_fuser::ego::{Ego, EgoError};
 use fusion::method::Method;
-use fusion::model::{FusionStage, METHOD_KEY};
+use fusion::model::FusionStage;
 use fusion::{MapMetadata, ReceivedMaps};
 
 /// Reason why nothing is measured.

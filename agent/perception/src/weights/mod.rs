@@ -30,6 +30,11 @@ pub use save::{Precision, save};
 pub const CONFIG_KEY: &str = "config";
 /// Metadata key of the kind of the network.
 pub const KIND_KEY: &str = "kind";
+/// Metadata key of the fusion method; files of detectors contain it, and no kind.
+pub const METHOD_KEY: &str = "method";
+
+/// Kind of a detector.
+const DETECTOR_KIND: &str = "detector";
 
 /// One file of parameters, read and checked.
 #[derive(Debug)]
@@ -124,7 +129,8 @@ impl Weights {
     /// # Errors
     /// [`WeightsError::Kind`] when it is another one.
     pub fn check_kind(&self, expected: &'static str) -> Result<(), WeightsError> {
-        match self.metadata(KIND_KEY) {
+        let detector = || self.metadata(METHOD_KEY).map(|_| DETECTOR_KIND);
+        match self.metadata(KIND_KEY).or_else(detector) {
             Some(found) if found != expected => {
                 Err(WeightsError::Kind { path: self.path.clone(), found: found.to_owned(), expected })
             }
@@ -145,7 +151,7 @@ impl Weights {
     /// # Errors
     /// [`WeightsError::Kind`] when the file names another kind of network; see [`Self::metadata_json`].
     pub fn detector_config(&self) -> Result<DetectorConfig, WeightsError> {
-        self.check_kind("detector")?;
+        self.check_kind(DETECTOR_KIND)?;
         self.config()
     }
 
@@ -316,6 +322,10 @@ mod tests {
         save(&path, &network(&small()), &about, Precision::Single).unwrap();
         let message = Weights::load(&path).unwrap().detector_config().unwrap_err().to_string();
         assert!(message.contains("\"scene encoder\"") && message.contains("\"detector\""), "{message}");
+        let about = [(METHOD_KEY.to_owned(), "max".to_owned())].into();
+        save(&path, &network(&small()), &about, Precision::Single).unwrap();
+        let message = Weights::load(&path).unwrap().check_kind("scene encoder").unwrap_err().to_string();
+        assert!(message.contains("\"detector\""), "{message}");
     }
 
     #[test]

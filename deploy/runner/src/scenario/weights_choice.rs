@@ -3,8 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use fusion::Method;
-use fusion::model::METHOD_KEY;
-use perception::weights::{Weights, WeightsError};
+use perception::weights::{METHOD_KEY, Weights, WeightsError};
 
 /// File name of the weights of a training.
 const TRAINED_FILE: &str = "weights.safetensors";

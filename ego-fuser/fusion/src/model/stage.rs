@@ -6,12 +6,11 @@ use std::cell::RefCell;
 
 use perception::int8::ScaleSearch;
 use perception::model_config::{ConfigError, DetectorConfig, YAxis};
-use perception::weights::{Weights, WeightsError};
+use perception::weights::{METHOD_KEY, Weights, WeightsError};
 use protocol::{BevGrid, Pose};
 use tch::nn::{self, VarStore};
 use tch::{Device, TchError, Tensor};
 
-use super::METHOD_KEY;
 use crate::channel_mixing::{self, ChannelMixing};
 use crate::classes::Classes;
 use crate::f64_tensor::{Order, are_numbers};
