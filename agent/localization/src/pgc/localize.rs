@@ -19,6 +19,7 @@ use super::pose_search::{PoseSearch, SearchTimes};
 use super::pose_solver::{self, FoundPose, PoseSolver, Solved};
 use super::pose_std::PoseStd;
 use super::scene_encoder::SceneFeatures;
+use super::scene_parts::{MOST_PARTS, logits_by_part};
 use super::scene_regression::SceneHead;
 use super::voxelise::Cell;
 use crate::registration::Correspondence;
@@ -147,6 +148,7 @@ pub struct Localizer {
     encoder: CellEncoder,
     head: SceneHead,
     solver: PoseSolver,
+    most_parts: usize,
     device: Device,
     sha256: [String; 2],
 }
@@ -195,7 +197,8 @@ impl Localizer {
             quantised.map_err(|error| weights.quantise_error(error))?;
         }
         let sha256 = [encoder_sha256, weights.sha256().to_owned()];
-        Ok((Self { encoder: network, head: scene_head, solver: PoseSolver::default(), device, sha256 }, weights))
+        let solver = PoseSolver::default();
+        Ok((Self { encoder: network, head: scene_head, solver, most_parts: MOST_PARTS, device, sha256 }, weights))
     }
 
     /// Adds the activations of a sweep to a search for their scales; a sweep without cells has none.
@@ -239,7 +242,7 @@ impl Localizer {
     ) -> Result<(SceneCoordinates, LocalizerTimes), LocalizerError> {
         let mut times = LocalizerTimes::default();
         let coordinates = match self.encode(sweep, &mut times)? {
-            Some(encoded) => self.regress(&encoded, CELLS, &mut times)?,
+            Some(encoded) => self.regress(&encoded, CELLS, &self.classify(&encoded)?, &mut times)?,
             None => SceneCoordinates::default(),
         };
         Ok((coordinates, times))
@@ -278,11 +281,17 @@ impl Localizer {
         Ok(Some(EncodedSweep { sweep, features, refinement_cells }))
     }
 
-    /// Scene coordinates of at most `count` cells (classification and Eq. 4).
+    /// Logits `[1, classes]` of the parts of the scene.
+    fn classify(&self, encoded: &EncodedSweep) -> Result<Tensor, TchError> {
+        no_grad(|| self.head.classify(&encoded.features.sweeps, false))
+    }
+
+    /// Scene coordinates of at most `count` cells in the part of the scene that the logits `[1, classes]` choose (Eq. 4).
     fn regress(
         &self,
         encoded: &EncodedSweep,
         count: usize,
+        logits: &Tensor,
         times: &mut LocalizerTimes,
     ) -> Result<SceneCoordinates, LocalizerError> {
         let EncodedSweep { sweep, features, .. } = encoded;
@@ -290,7 +299,7 @@ impl Localizer {
         let chosen = choose_evenly(sweep.cells(), self.head.config().max_cells.min(count));
         let SweepCells { features: cells, sensor_m } = self.pick(sweep, features, &chosen)?;
         let (world, epsilon_m) = no_grad(|| -> Result<(Vec<f32>, Vec<f32>), TchError> {
-            let logits = self.head.classify(&features.sweeps, false)?.f_expand([chosen.len() as i64, -1], false)?;
+            let logits = logits.f_expand([chosen.len() as i64, -1], false)?;
             let regression = self.head.regress(&self.head.normalise(&cells)?, &logits, Kind::Float)?;
             let world = Vec::try_from(&regression.coordinates_m.f_reshape([-1])?.f_to_device(Device::Cpu)?)?;
             Ok((world, Vec::try_from(&regression.epsilon_m.f_to_device(Device::Cpu)?)?))
@@ -300,15 +309,25 @@ impl Localizer {
         Ok(SceneCoordinates { sensor_m, world_m: world.as_chunks().0.to_vec(), epsilon_m, origin_m })
     }
 
-    /// Pose from the sweep alone.
+    /// Pose from the sweep alone: as the classifier places it, then, while few cells are inliers, in one likely part of
+    /// the scene after another.
     fn search(&self, encoded: &EncodedSweep, mut times: LocalizerTimes) -> Result<Localization, LocalizerError> {
-        let coordinates = self.regress(encoded, CELLS, &mut times)?;
         let search = PoseSearch { head: &self.head, solver: &self.solver, kind: Kind::Float };
-        let mut spent = SearchTimes::default();
-        let solved = search.run(&coordinates, &encoded.refinement_cells, &mut spent)?;
+        let (cells, mut spent) = (&encoded.refinement_cells, SearchTimes::default());
+        let logits = self.classify(encoded)?;
+        let mut best = search.run(&self.regress(encoded, CELLS, &logits, &mut times)?, cells, &mut spent)?;
+        if !best.is_sufficient() {
+            for part in logits_by_part(&logits, self.most_parts)? {
+                let coordinates = self.regress(encoded, CELLS, &part, &mut times)?;
+                best = best.or_better(search.run_in_part(&coordinates, cells, &mut spent)?);
+                if best.is_sufficient() {
+                    break;
+                }
+            }
+        }
         times.solve = spent.solve;
         times.refine += spent.refine;
-        Ok(Localization::new(&solved, times))
+        Ok(Localization::new(&best.into_solved(), times))
     }
 
     /// Pose near a predicted one, from the pose refinement alone; `None` if the sweep does not confirm it.
@@ -321,7 +340,7 @@ impl Localizer {
         let origin_m = Vector3::from(self.head.config().origin_m);
         let mut origin_from_sensor = *world_from_sensor;
         origin_from_sensor.translation.vector -= origin_m;
-        let few = self.regress(encoded, levelling::CELLS, times)?;
+        let few = self.regress(encoded, levelling::CELLS, &self.classify(encoded)?, times)?;
         let start = Instant::now();
         let origin_from_sensor = levelling::level(&few, &origin_from_sensor);
         let refined =
@@ -341,6 +360,11 @@ impl Localizer {
     #[must_use]
     pub fn solver(&self) -> &PoseSolver {
         &self.solver
+    }
+
+    /// Sets the largest number of parts of the scene in which a sweep is sought whose pose few cells confirm.
+    pub fn set_most_parts(&mut self, most: usize) {
+        self.most_parts = most;
     }
 
     /// Sets another search or confidence.

@@ -22,6 +22,7 @@ mod pose_std;
 mod refinement_network;
 mod residual_group;
 pub(crate) mod scene_encoder;
+mod scene_parts;
 pub(crate) mod scene_regression;
 pub mod synthetic;
 pub(crate) mod voxel_batch;

@@ -93,6 +93,9 @@ impl TrackedPoseConfig {
 
 /// Largest standard deviation of a tracked position, metres: the next good measurement is still near the prediction.
 const MAX_POSITION_STD_M: f64 = 2.0;
+/// Largest number of parts of the scene in which a sweep is sought: a lost vehicle is sought again in its next sweep, and
+/// outside the scene every sweep costs them all.
+const MOST_PARTS: usize = 4;
 
 /// Follows one vehicle and measures its pose in some of its sweeps.
 #[derive(Debug)]
@@ -115,7 +118,8 @@ impl TrackedPose {
     /// # Errors
     /// [`LocalizerError`] names the file and what is wrong with it.
     pub fn load(config: &TrackedPoseConfig, inference: Inference) -> Result<Self, LocalizerError> {
-        let localizer = Localizer::load(&config.encoder, &config.head, inference)?;
+        let mut localizer = Localizer::load(&config.encoder, &config.head, inference)?;
+        localizer.set_most_parts(MOST_PARTS);
         Ok(Self::new(Box::new(localizer), config.clone()))
     }
 

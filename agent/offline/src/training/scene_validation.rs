@@ -68,7 +68,7 @@ pub(super) fn validate(
             origin_m: head.config().origin_m,
         };
         let refinement_cells = SweepCells { features, sensor_m: coordinates.sensor_m.clone() };
-        let found = search.run(&coordinates, &refinement_cells, &mut SearchTimes::default())?;
+        let found = search.run(&coordinates, &refinement_cells, &mut SearchTimes::default())?.into_solved();
         let (metres, degrees) = found.map_or((f64::INFINITY, 180.0), |found| {
             let error = PoseError::between(&found.world_from_sensor.into(), &(*truth).into());
             (error.distance_m, error.angle_deg)
