@@ -3,7 +3,7 @@
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 use protocol::{NoPoseReason, PoseEstimate};
 
-use crate::pgc::localize::{Localization, LocalizerTimes};
+use crate::pgc::{Localization, LocalizerTimes};
 
 /// Confidence of a pose that is regressed directly: such a network predicts no error.
 pub(super) const FULL_CONFIDENCE: f32 = 1.0;

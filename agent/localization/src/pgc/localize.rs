@@ -1,10 +1,10 @@
 //! Live localization pipeline: from a sweep to a pose with its confidence.
 
 use std::path::Path;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use nalgebra::{Isometry3, Vector3};
-use protocol::{PointCloud, PoseEstimate, StageTiming};
+use protocol::PointCloud;
 use tch::nn::VarStore;
 use tch::{Device, Kind, TchError, Tensor, no_grad};
 
@@ -13,11 +13,10 @@ use super::confidence::{CONFIDENCE_KEY, Confidence, ConfidenceModel};
 use super::error::LocalizerError;
 use super::head_config::SceneHeadConfig;
 use super::levelling;
-use super::pose_evidence::PoseEvidence;
+use super::localization::{Localization, LocalizerTimes};
 use super::pose_refinement::{self, SweepCells};
-use super::pose_search::{PoseSearch, SearchTimes};
-use super::pose_solver::{self, FoundPose, PoseSolver, Solved};
-use super::pose_std::PoseStd;
+use super::pose_search::{Attempt, PoseSearch, SearchTimes};
+use super::pose_solver::{self, FoundPose, PoseSolver};
 use super::scene_encoder::SceneFeatures;
 use super::scene_parts::{MOST_PARTS, logits_by_part};
 use super::scene_regression::SceneHead;
@@ -55,36 +54,6 @@ struct EncodedSweep {
     features: SceneFeatures,
     /// Cells of the pose refinement.
     refinement_cells: SweepCells,
-}
-
-/// Time per stage.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct LocalizerTimes {
-    /// Voxels and rulebooks from points.
-    pub voxelise: Duration,
-    /// Scene encoder.
-    pub encode: Duration,
-    /// Scene head.
-    pub regress: Duration,
-    /// Pose solver.
-    pub solve: Duration,
-    /// Pose refinement, its fits included.
-    pub refine: Duration,
-}
-
-/// Result of one sweep.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Localization {
-    /// `world_from_lidar` with its confidence, or the reason why there is none.
-    pub estimate: PoseEstimate,
-    /// The pose with its evidence, also if `estimate` rejects it.
-    pub found: Option<FoundPose>,
-    /// Number of inliers.
-    pub inlier_count: u32,
-    /// Inliers as a share of all regressed cells, 0..=1.
-    pub inlier_ratio: f64,
-    /// Time per stage.
-    pub times: LocalizerTimes,
 }
 
 /// Input of a localizer: one sweep.
@@ -309,25 +278,42 @@ impl Localizer {
         Ok(SceneCoordinates { sensor_m, world_m: world.as_chunks().0.to_vec(), epsilon_m, origin_m })
     }
 
-    /// Pose from the sweep alone: as the classifier places it, then, while few cells are inliers, in one likely part of
-    /// the scene after another.
+    /// Pose from the sweep alone.
     fn search(&self, encoded: &EncodedSweep, mut times: LocalizerTimes) -> Result<Localization, LocalizerError> {
-        let search = PoseSearch { head: &self.head, solver: &self.solver, kind: Kind::Float };
-        let (cells, mut spent) = (&encoded.refinement_cells, SearchTimes::default());
-        let logits = self.classify(encoded)?;
-        let mut best = search.run(&self.regress(encoded, CELLS, &logits, &mut times)?, cells, &mut spent)?;
-        if !best.is_sufficient() {
-            for part in logits_by_part(&logits, self.most_parts)? {
-                let coordinates = self.regress(encoded, CELLS, &part, &mut times)?;
-                best = best.or_better(search.run_in_part(&coordinates, cells, &mut spent)?);
-                if best.is_sufficient() {
-                    break;
-                }
-            }
-        }
+        let mut spent = SearchTimes::default();
+        let best = self.best_pose(encoded, &mut times, &mut spent)?;
         times.solve = spent.solve;
         times.refine += spent.refine;
         Ok(Localization::new(&best.into_solved(), times))
+    }
+
+    /// Pose in the part of the scene that the classifier chooses; while few cells are inliers, in other likely parts, and
+    /// at last along the street.
+    fn best_pose(
+        &self,
+        encoded: &EncodedSweep,
+        times: &mut LocalizerTimes,
+        spent: &mut SearchTimes,
+    ) -> Result<Attempt, LocalizerError> {
+        let search = PoseSearch { head: &self.head, solver: &self.solver, kind: Kind::Float };
+        let cells = &encoded.refinement_cells;
+        let logits = self.classify(encoded)?;
+        let mut coordinates = self.regress(encoded, CELLS, &logits, times)?;
+        let mut best = search.run(&coordinates, cells, spent)?;
+        if best.is_sufficient() {
+            return Ok(best);
+        }
+        for part in logits_by_part(&logits, self.most_parts)? {
+            let there = self.regress(encoded, CELLS, &part, times)?;
+            let next = search.run_in_part(&there, cells, spent)?;
+            if next.is_better_than(&best) {
+                (best, coordinates) = (next, there);
+            }
+            if best.is_sufficient() {
+                break;
+            }
+        }
+        Ok(search.run_along(best, &coordinates, cells, spent)?)
     }
 
     /// Pose near a predicted one, from the pose refinement alone; `None` if the sweep does not confirm it.
@@ -412,64 +398,6 @@ impl Localize for Localizer {
             Some(found) => Ok(Localization::new(&Ok(found), times)),
             None => self.search(&encoded, times),
         }
-    }
-}
-
-impl Localization {
-    /// Result of a solver.
-    #[must_use]
-    pub fn new(solved: &Solved, times: LocalizerTimes) -> Self {
-        let found = solved.as_ref().ok().copied();
-        let inliers = match solved {
-            Ok(found) => found.evidence.inliers,
-            Err(none) => none.inlier_count(),
-        };
-        Self {
-            estimate: pose_solver::estimate(solved),
-            found,
-            inlier_count: u32::try_from(inliers).unwrap_or(u32::MAX),
-            inlier_ratio: found.map_or(0.0, |found| found.evidence.inlier_ratio),
-            times,
-        }
-    }
-}
-
-impl Localization {
-    /// Result of a method without cells: its estimate is the only evidence.
-    #[must_use]
-    pub fn from_estimate(estimate: PoseEstimate, times: LocalizerTimes) -> Self {
-        let (found, inlier_count) = match estimate {
-            PoseEstimate::Pose { world_from_cav, confidence, .. } => {
-                let (world_from_sensor, sigma) = (world_from_cav.isometry(), f64::from(confidence));
-                let (evidence, cell_covariance) = (PoseEvidence::none(), PoseStd::UNBOUNDED.covariance);
-                (Some(FoundPose { world_from_sensor, evidence, cell_covariance, sigma, is_rejected: false }), 0)
-            }
-            PoseEstimate::NoPose { inlier_count, .. } => (None, inlier_count),
-        };
-        Self { estimate, found, inlier_count, inlier_ratio: 0.0, times }
-    }
-}
-
-impl LocalizerTimes {
-    /// Stages by name, in their order.
-    #[must_use]
-    pub fn stages(&self) -> Vec<StageTiming> {
-        let Self { voxelise, encode, regress, solve, refine } = *self;
-        [
-            ("pose voxelise", voxelise),
-            ("pose encode", encode),
-            ("pose regress", regress),
-            ("pose solve", solve),
-            ("pose refine", refine),
-        ]
-        .map(|(stage, time)| StageTiming::new(stage, time))
-        .into()
-    }
-
-    /// Sum of all stages.
-    #[must_use]
-    pub fn total(&self) -> Duration {
-        self.voxelise + self.encode + self.regress + self.solve + self.refine
     }
 }
 

@@ -97,6 +97,15 @@ impl PoseSolver {
         Ok(if is_wider { Registration::judge(&pairs, found.target_from_source, threshold_m) } else { found })
     }
 
+    /// A given pose relative to the origin of `coordinates`, with its inliers as in [`Self::search`].
+    pub(super) fn registration_at(&self, coordinates: &SceneCoordinates, pose: Isometry3<f64>) -> Registration {
+        let threshold_m = match &self.solver {
+            Solver::Ransac(config) => config.inlier_threshold_m,
+            Solver::Sc2Pcr(config) => config.inlier_threshold_m,
+        };
+        Registration::judge(&coordinates.correspondences(), pose, threshold_m)
+    }
+
     /// Last step: confidence of the pose after refinement, if there was one.
     pub(super) fn judge(
         &self,

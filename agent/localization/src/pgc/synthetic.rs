@@ -6,7 +6,8 @@ use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, Normal};
 
 use super::error::LocalizerError;
-use super::localize::{Localization, Localize, LocalizerInput, LocalizerTimes, SceneCoordinates};
+use super::localization::{Localization, LocalizerTimes};
+use super::localize::{Localize, LocalizerInput, SceneCoordinates};
 use super::pose_solver::PoseSolver;
 
 /// Origin of the scene in the world: far away, as in maps in UTM coordinates, metres.

@@ -11,11 +11,12 @@ use tch::{Device, Kind, Tensor, no_grad};
 use super::{SgLoc, SgLocConfig};
 use crate::baselines::regressed_pose::no_pose;
 use crate::pgc::error::LocalizerError;
-use crate::pgc::localize::{Localization, Localize, LocalizerInput, LocalizerTimes, SceneCoordinates, choose_evenly};
+use crate::pgc::localize::{Localize, LocalizerInput, SceneCoordinates, choose_evenly};
 use crate::pgc::pose_solver::{MIN_CELLS, PoseSolver};
 use crate::pgc::scene_encoder::SceneFeatures;
 use crate::pgc::voxel_batch::VoxelBatch;
 use crate::pgc::voxelise::SweepVoxels;
+use crate::pgc::{Localization, LocalizerTimes};
 
 /// Largest number of cells of a sweep that are regressed. More than of PGC: their coordinates are less accurate.
 const CELLS: usize = 1024;
