@@ -18,6 +18,9 @@ const FLUSH_PERIOD: Duration = Duration::from_secs(1);
 /// Time after the end of the replay during which messages of the run may still arrive.
 const LAST_WORDS: Duration = Duration::from_secs(3);
 
+/// Silence that ends a recording that is asked to stop: messages published before that may still be under way.
+const SILENCE: Duration = Duration::from_millis(200);
+
 /// Options of the recorder.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct RecorderOptions {
@@ -92,7 +95,7 @@ pub enum RecorderError {
     Bus(#[from] BusError),
 }
 
-/// Records the run of `bus` until it ends or `stop` is requested. If writing fails (full disk, for example),
+/// Records the run of `bus` until it ends, or `stop` is requested and no message has come for a moment. If writing fails (full disk, for example),
 /// `on_failure` is called once, the run continues, and the messages not recorded are counted.
 ///
 /// # Errors
@@ -113,7 +116,6 @@ pub fn record(
         Err(error) => return Err(error.into()),
     };
     let tap = bus.tap(&[KeyExpr::run(&bus.identity().run)], PLACES)?;
-    stop.on_request(tap.closer());
     let presence = bus.announce(protocol::Role::Recorder)?;
     let mut recorder = Recorder {
         writer,
@@ -137,7 +139,7 @@ pub fn record(
     if recorder.report.failure.is_some() {
         (recorder.on_failure)(&recorder.report);
     }
-    recorder.listen(&tap, options.keeps_running);
+    recorder.listen(&tap, options.keeps_running, stop);
     let report = recorder.finish(tap.overwritten(), tap.undelivered());
     presence.withdraw()?;
     Ok(report)
@@ -159,11 +161,13 @@ struct Recorder<'a> {
 }
 
 impl Recorder<'_> {
-    fn listen(&mut self, tap: &PassiveSubscriber, keeps_running: bool) {
+    fn listen(&mut self, tap: &PassiveSubscriber, keeps_running: bool, stop: &Stop) {
         let mut flush_at = Instant::now() + FLUSH_PERIOD;
+        let (mut stopping, mut last_message) = (None, Instant::now());
         loop {
-            match tap.take(Some(flush_at)) {
+            match tap.take(Some(flush_at.min(Instant::now() + SILENCE))) {
                 Pop::Item(topic, raw) => {
+                    last_message = Instant::now();
                     if topic == Topic::Control(Verb::End) {
                         self.over = Some(Instant::now());
                     }
@@ -173,6 +177,12 @@ impl Recorder<'_> {
                 Pop::Closed => return,
             }
             let now = Instant::now();
+            if stop.requested() {
+                let since = *stopping.get_or_insert(now);
+                if now - last_message.max(since) >= SILENCE || now - since >= LAST_WORDS {
+                    return;
+                }
+            }
             if now >= flush_at {
                 flush_at = now + FLUSH_PERIOD;
                 self.attempt(RecordingWriter::flush);
