@@ -95,8 +95,10 @@ pub enum RecorderError {
     Bus(#[from] BusError),
 }
 
-/// Records the run of `bus` until it ends, or `stop` is requested and no message has come for a moment. If writing fails (full disk, for example),
-/// `on_failure` is called once, the run continues, and the messages not recorded are counted.
+/// Records the run of `bus` until it ends, or `stop` is requested and no message has come for a moment.
+///
+/// If writing fails (full disk, for example), `on_failure` is called once, the run continues, and the messages not
+/// recorded are counted.
 ///
 /// # Errors
 /// [`RecorderError`] if the recording cannot begin.
