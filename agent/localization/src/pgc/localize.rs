@@ -80,7 +80,7 @@ pub trait Localize: std::fmt::Debug + Send {
     ///
     /// # Errors
     /// [`LocalizerError::Tensor`] when the tensor library fails. A sweep that cannot be localized is no error but a
-    /// result: [`PoseEstimate::NoPose`].
+    /// result: [`protocol::PoseEstimate::NoPose`].
     fn localize_sweep(&mut self, sweep: LocalizerInput<'_>) -> Result<Localization, LocalizerError>;
 
     /// Localizes one sweep of which nothing is computed yet.
@@ -362,7 +362,7 @@ impl Localizer {
     ///
     /// # Errors
     /// [`LocalizerError::Tensor`] when the tensor library fails. A sweep that cannot be localized is no error but a
-    /// result: [`PoseEstimate::NoPose`].
+    /// result: [`protocol::PoseEstimate::NoPose`].
     pub fn localize(&self, cloud: &PointCloud) -> Result<Localization, LocalizerError> {
         self.localize_globally(LocalizerInput::of(cloud))
     }
