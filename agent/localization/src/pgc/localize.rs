@@ -255,7 +255,8 @@ impl Localizer {
         no_grad(|| self.head.classify(&encoded.features.sweeps, false))
     }
 
-    /// Scene coordinates of at most `count` cells in the part of the scene that the logits `[1, classes]` choose (Eq. 4).
+    /// Scene coordinates of at most `count` cells in the part of the scene that the logits `[1, classes]` choose
+    /// (Eq. 4).
     fn regress(
         &self,
         encoded: &EncodedSweep,
@@ -287,8 +288,8 @@ impl Localizer {
         Ok(Localization::new(&best.into_solved(), times))
     }
 
-    /// Pose in the part of the scene that the classifier chooses; while few cells are inliers, in other likely parts, and
-    /// at last along the street.
+    /// Pose in the part of the scene that the classifier chooses; while few cells are inliers, in other likely parts,
+    /// and at last along the street.
     fn best_pose(
         &self,
         encoded: &EncodedSweep,

@@ -114,8 +114,8 @@ impl PoseSearch<'_> {
         self.attempt(coordinates, refinement_cells, PART_WIDENING, times)
     }
 
-    /// Refinements that start before and behind the pose of `best`, which was found with `coordinates`: poles, trees and
-    /// parked vehicles stand in rows, and a pose one place further along the street fits almost as well.
+    /// Refinements that start before and behind the pose of `best`, which was found with `coordinates`: poles, trees
+    /// and parked vehicles stand in rows, and a pose one place further along the street fits almost as well.
     ///
     /// # Errors
     /// As [`Self::run`].
