@@ -2,6 +2,7 @@
 
 mod flood;
 mod link;
+mod recorder;
 mod replay;
 mod ros2;
 mod sessions;

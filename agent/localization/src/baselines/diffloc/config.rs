@@ -36,7 +36,7 @@ pub struct DiffLocConfig {
 }
 
 impl DiffLocConfig {
-    /// The small network: 32 x 512 images, 256 tokens, 192 channels.
+    /// The small network: 16 x 256 images, 256 tokens, 192 channels.
     #[must_use]
     pub fn small() -> Self {
         Self {
@@ -44,8 +44,8 @@ impl DiffLocConfig {
             origin_m: [0.0; 3],
             scale_m: [1.0; 3],
             image: RangeImageConfig::default(),
-            patch: [4, 16],
-            stem: [32, 64],
+            patch: [2, 8],
+            stem: [32, 32],
             width: 192,
             heads: 3,
             layers: 6,

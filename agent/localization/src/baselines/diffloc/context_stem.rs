@@ -2,7 +2,7 @@
 
 use perception::layers::convolution::Norm;
 use tch::nn::{self, Init};
-use tch::{Device, Kind, TchError, Tensor};
+use tch::{Kind, TchError, Tensor};
 
 use super::config::DiffLocConfig;
 use super::range_image::CHANNELS;
@@ -100,10 +100,10 @@ impl ContextStem {
     }
 }
 
-/// Channels next to each other in memory on a GPU, where convolutions in half precision are faster so.
+/// Channels next to each other in memory, where convolutions in half precision are faster.
 fn channels_last(x: &Tensor) -> Result<Tensor, TchError> {
-    match (x.device(), x.kind()) {
-        (Device::Cpu, _) | (_, Kind::Float) => Ok(x.shallow_clone()),
+    match x.kind() {
+        Kind::Float => Ok(x.shallow_clone()),
         _ => x.f_permute([0, 2, 3, 1])?.f_contiguous()?.f_permute([0, 3, 1, 2]),
     }
 }

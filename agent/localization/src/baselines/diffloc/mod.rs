@@ -6,7 +6,7 @@
 //!
 //! Departures from the paper: a transformer of six layers of 192 channels with random weights at the start, where the
 //! paper has a foundation model of 21 million parameters; a denoiser of three layers; cosine and sine of the heading in
-//! place of a quaternion's logarithm, since training turns sweeps all the way round and vehicles stand upright.
+//! place of a quaternion's logarithm, since vehicles head in all directions and stand upright.
 
 mod config;
 mod context_stem;

@@ -25,10 +25,10 @@ pub struct RangeImageConfig {
 }
 
 impl Default for RangeImageConfig {
-    /// 32 x 512; each row holds two of 64 channels from -25 to 2 degrees, the LiDAR of the generated scenes and of
+    /// 16 x 256; each row holds four of 64 channels from -25 to 2 degrees, the LiDAR of the generated scenes and of
     /// OPV2V.
     fn default() -> Self {
-        Self { rows: 32, columns: 512, elevations_deg: [-25.214, 2.214] }
+        Self { rows: 16, columns: 256, elevations_deg: [-25.214, 2.214] }
     }
 }
 
@@ -116,14 +116,14 @@ mod tests {
     }
 
     #[test]
-    fn two_channels_of_the_generated_lidar_share_a_row() {
+    fn four_channels_of_the_generated_lidar_share_a_row() {
         let config = RangeImageConfig::default();
         let row = |channel: usize| {
             let elevation = (-25.0 + 27.0 / 63.0 * channel as f32).to_radians();
             config.pixel([10.0 * elevation.cos(), 0.0, 10.0 * elevation.sin()]).map(|(pixel, _)| pixel / config.columns)
         };
         assert!(
-            (0..64).all(|channel| row(channel) == Some(31 - channel / 2)),
+            (0..64).all(|channel| row(channel) == Some(15 - channel / 4)),
             "{:?}",
             (0..64).map(row).collect::<Vec<_>>()
         );

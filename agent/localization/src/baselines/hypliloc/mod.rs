@@ -7,8 +7,7 @@
 //! instead of 4,096, half as many channels, and a residual network of 16 to 128 channels without pretraining, on an
 //! image of half the columns, to 46 tokens instead of 23.
 //!
-//! Departures: the heading is a cosine and a sine instead of a log-quaternion, since training turns sweeps all the way
-//! round; the image has the channels x, y, z and range, for the mean of tokens would not tell a direction otherwise; a
+//! Departures: the heading is a cosine and a sine instead of a log-quaternion, since vehicles head in all directions; the image has the channels x, y, z and range, for the mean of tokens would not tell a direction otherwise; a
 //! head of the attention has a ball of its own and returns from it by the logarithm before the layer norm; the learnt
 //! metric begins as the identity.
 

@@ -6,7 +6,7 @@ use agent_offline::training::{DiffLocAccuracy, DiffLocReport, DiffLocTrainConfig
 use localization::baselines::diffloc::DiffLocConfig;
 use perception::train::{AdamWConfig, ModelCard, RunConfig, TrainingBar, TrainingOptions};
 
-use super::options::{SceneSweeps, bad, check_folders, print_left_out, run_config};
+use super::options::{SceneSweeps, SensorTurns, bad, check_folders, print_left_out, run_config};
 
 /// Decoupled weight decay: sweeps are few beside the parameters.
 const WEIGHT_DECAY: f64 = 0.05;
@@ -23,14 +23,13 @@ pub(crate) struct Args {
     #[arg(long, num_args = 1.., value_name = "DIR")]
     validation: Vec<PathBuf>,
     /// Sweeps per step, in windows of three.
-    #[arg(long, default_value_t = 192)]
+    #[arg(long, default_value_t = 48)]
     batch: usize,
     /// Highest learning rate.
-    #[arg(long, default_value_t = 1e-3)]
+    #[arg(long, default_value_t = 5e-4)]
     lr: f64,
-    /// Largest random turn of the sensor to either side, degrees.
-    #[arg(long, value_name = "DEGREES", default_value_t = 180.0)]
-    turn: f64,
+    #[command(flatten)]
+    turns: SensorTurns,
     /// Largest random shift of the sensor along each horizontal axis, metres.
     #[arg(long, value_name = "METRES", default_value_t = 1.0)]
     shift: f64,
@@ -50,7 +49,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         "Pose regression by denoising diffusion, trained from random weights on the sweeps of one scene.",
     );
     card.trained(&config.run, &summary.trained, &format!("{} sweeps", summary.sweeps), "sweeps");
-    card.row("augmentation", format_args!("turns up to {} degrees, shifts up to {} m", args.turn, args.shift));
+    card.row("augmentation", format_args!("turns up to {} degrees, shifts up to {} m", args.turns.turn, args.shift));
     card.row("mask of static objects", "supervised: pixels in annotated boxes are not static");
     if let Some(accuracy) = summary.validation {
         card.row("validation", text(&accuracy));
@@ -66,9 +65,6 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
 
 impl Args {
     fn config(&self) -> anyhow::Result<DiffLocTrainConfig> {
-        if !(0.0..=180.0).contains(&self.turn) {
-            return Err(bad(&format!("--turn is {}, must be 0 to 180 degrees", self.turn)));
-        }
         if !(0.0..=10.0).contains(&self.shift) {
             return Err(bad(&format!("--shift is {}, must be 0 to 10 metres", self.shift)));
         }
@@ -80,7 +76,7 @@ impl Args {
             scenes: self.sweeps.scenes.clone(),
             validation: self.validation.clone(),
             network: DiffLocConfig { scene_name: self.sweeps.scene_name.clone(), ..DiffLocConfig::small() },
-            turn_rad: self.turn.to_radians(),
+            turn_rad: self.turns.largest_rad()?,
             shift_m: self.shift,
             run: RunConfig { optimizer, ..run },
         })

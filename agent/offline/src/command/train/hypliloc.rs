@@ -3,7 +3,7 @@
 use agent_offline::training::{HypLiLocReport, HypLiLocTrainConfig, train_hypliloc};
 use perception::train::{ModelCard, TrainingBar, TrainingOptions};
 
-use super::options::{SceneSweeps, check_folders, print_left_out, run_config};
+use super::options::{SceneSweeps, SensorTurns, check_folders, print_left_out, run_config};
 
 /// Train a small HypLiLoc on one scene; writes checkpoint, weights.safetensors and model-card.md.
 ///
@@ -12,11 +12,13 @@ use super::options::{SceneSweeps, check_folders, print_left_out, run_config};
 pub(crate) struct Args {
     #[command(flatten)]
     sweeps: SceneSweeps,
+    #[command(flatten)]
+    turns: SensorTurns,
     /// Sweeps per step.
-    #[arg(long, default_value_t = 128)]
+    #[arg(long, default_value_t = 32)]
     batch: usize,
     /// Highest learning rate.
-    #[arg(long, default_value_t = 1e-3)]
+    #[arg(long, default_value_t = 5e-4)]
     lr: f64,
     #[command(flatten)]
     options: TrainingOptions,
@@ -27,6 +29,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     let config = HypLiLocTrainConfig {
         scenes: args.sweeps.scenes.clone(),
         scene_name: args.sweeps.scene_name.clone(),
+        turn_rad: args.turns.largest_rad()?,
         run: run_config(&args.options, args.batch, args.lr)?,
     };
     let bar = TrainingBar::of(config.run.length);
@@ -43,6 +46,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     let title = format!("HypLiLoc, small, of {}", config.scene_name);
     let mut card = ModelCard::new(&title, "Trained from random weights on the sweeps of one scene.");
     card.trained(&config.run, &trained, "all sweeps", "sweeps");
+    card.row("augmentation", format_args!("turns up to {} degrees", args.turns.turn));
     if let Some((error_m, error_deg)) = latest {
         card.row("mean error of the last steps, training sweeps", format!("{error_m:.2} m, {error_deg:.1} deg"));
     }

@@ -18,6 +18,24 @@ pub(crate) struct SceneSweeps {
     pub(crate) scene_name: String,
 }
 
+/// Random turns of the sensor.
+#[derive(Debug, clap::Args)]
+pub(crate) struct SensorTurns {
+    /// Largest random turn of the sensor to either side, degrees; vehicles in lanes head as those of the training.
+    #[arg(long, value_name = "DEGREES", default_value_t = 20.0)]
+    pub(crate) turn: f64,
+}
+
+impl SensorTurns {
+    /// The largest turn, radians; an impossible one is a usage error.
+    pub(crate) fn largest_rad(&self) -> anyhow::Result<f64> {
+        if !(0.0..=180.0).contains(&self.turn) {
+            return Err(bad(&format!("--turn is {}, must be 0 to 180 degrees", self.turn)));
+        }
+        Ok(self.turn.to_radians())
+    }
+}
+
 /// Error with exit code 2.
 pub(crate) fn bad(reason: &str) -> anyhow::Error {
     BadInput::new(reason.to_owned()).into()

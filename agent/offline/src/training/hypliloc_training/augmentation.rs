@@ -1,4 +1,4 @@
-//! Augmentation on the device: any heading, noise, points and cells left out.
+//! Augmentation on the device: turned sweeps, noise, points and cells left out.
 
 use std::f64::consts::TAU;
 
@@ -12,11 +12,12 @@ const JITTER_M: f64 = 0.05;
 /// Largest share of a sweep's points and cells that is left out.
 const MAX_DROPPED: f64 = 0.3;
 
-/// Turns each sweep about the vertical by a random whole number of columns of the image, which its heading follows,
-/// moves points and ranges a little, and leaves some out.
-pub(super) fn augment((batch, truth): (InputBatch, Truth)) -> Result<(InputBatch, Truth), TchError> {
+/// Turns each sweep about the vertical by a random whole number of columns of the image, at most `turn_rad` to either
+/// side, which its heading follows; moves points and ranges a little, and leaves some out.
+pub(super) fn augment((batch, truth): (InputBatch, Truth), turn_rad: f64) -> Result<(InputBatch, Truth), TchError> {
     let (sweeps, device) = (batch.len(), batch.points_m.device());
-    let columns = Tensor::f_randint(COLUMNS, [sweeps], (Kind::Int64, device))?;
+    let most = (turn_rad / TAU * COLUMNS as f64).round() as i64;
+    let columns = Tensor::f_randint_low(-most, most + 1, [sweeps], (Kind::Int64, device))?;
     let ranges_m = roll_columns(&batch.ranges_m, &columns)?.f_to_kind(Kind::Float)?;
     let turn = columns.f_to_kind(Kind::Float)? * (TAU / COLUMNS as f64);
     let points_m = turned(&batch.points_m, &turn.f_unsqueeze(1)?)?;
@@ -76,7 +77,7 @@ mod tests {
         for _ in 0..8 {
             let batch = InputBatch::new(std::slice::from_ref(&input), Device::Cpu).unwrap();
             let truth = Truth { position: Tensor::from_slice(&[1f32, 2.0, 3.0]).view([1, 3]), heading: heading.copy() };
-            let (batch, truth) = augment((batch, truth)).unwrap();
+            let (batch, truth) = augment((batch, truth), TAU / 2.0).unwrap();
             let pair = |of: &Tensor| azimuth_deg(of.double_value(&[0]), of.double_value(&[1]));
             let heading_deg = pair(&truth.heading.view([2]));
             // The wall's middle: 40 degrees to the left of a vehicle that heads north.

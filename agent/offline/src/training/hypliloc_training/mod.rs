@@ -33,6 +33,8 @@ pub struct HypLiLocTrainConfig {
     pub scenes: Vec<PathBuf>,
     /// Name of the scene.
     pub scene_name: String,
+    /// Largest turn of the sensor, radians.
+    pub turn_rad: f64,
     /// Training run; a batch are sweeps. Its time begins when all inputs are computed.
     pub run: RunConfig,
 }
@@ -80,7 +82,7 @@ pub fn train_hypliloc(
     let mut reported = trainer.steps();
     let mut errors = Tensor::f_zeros([2], (Kind::Float, run.device))?;
     while share_done(&trainer) < 1.0 {
-        let (batch, truth) = augment(examples.draw(run.batch as i64)?)?;
+        let (batch, truth) = augment(examples.draw(run.batch as i64)?, config.turn_rad)?;
         let poses = network.forward(&batch, run.precision.kind(), true)?;
         let loss = criteria.loss(&poses, &truth)?;
         trainer.step(&loss, share_done(&trainer))?;
@@ -115,6 +117,7 @@ pub fn train_hypliloc(
 
 #[cfg(test)]
 mod tests {
+    use std::f64::consts::PI;
     use std::path::Path;
 
     use localization::baselines::load_baseline;
@@ -128,7 +131,7 @@ mod tests {
 
     fn config(scene: &Path, out: &Path, steps: u64) -> HypLiLocTrainConfig {
         let run = RunConfig { batch: 2, ..RunConfig::new(Length::Steps(steps), out) };
-        HypLiLocTrainConfig { scenes: vec![scene.to_owned()], scene_name: "small".into(), run }
+        HypLiLocTrainConfig { scenes: vec![scene.to_owned()], scene_name: "small".into(), turn_rad: PI, run }
     }
 
     #[test]

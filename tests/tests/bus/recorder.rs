@@ -1,0 +1,46 @@
+//! Recorder: what arrives around the end of a recording.
+
+use bus::shutdown::Stop;
+use bus::{Barrier, PublisherOptions, Route};
+use protocol::{Gnss, GnssSource, Pose, Topic};
+use recording::RecordingOptions;
+use sim_replay::recorder::{self, RecordReport, RecorderOptions};
+use tests::bus::{TIMEOUT, TestRouter};
+
+/// Messages that are published once the recorder is asked to stop.
+const LATE: u64 = 20;
+
+fn gnss() -> Gnss {
+    Gnss {
+        world_from_lidar: Pose::from_xyz_yaw([1.0, 2.0, 0.0], 0.0),
+        position_std_m: 0.0,
+        heading_std_rad: 0.0,
+        source: GnssSource::Recorded,
+    }
+}
+
+/// Records what is published after the request to stop.
+fn record_late_messages(out: std::path::PathBuf) -> RecordReport {
+    let (router, stop) = (TestRouter::open(), Stop::new());
+    let bus = router.join("recorder", "recorder");
+    let replay = router.join("replay", "replay");
+    let topic: Topic = "7/gnss".parse().unwrap();
+    let publisher = replay.publisher(topic.clone(), PublisherOptions::SENSOR.lossless(8)).unwrap();
+    let recording = RecordingOptions::default();
+    let options = RecorderOptions { out, recording, without: Vec::new(), keeps_running: true };
+    std::thread::scope(|scope| {
+        let recorder = scope.spawn(|| recorder::record(&bus, &options, &stop, &mut |_| {}).unwrap());
+        let route = Route { topic, receiver: "recorder".parse().unwrap() };
+        Barrier::new([route]).await_routes(&replay).unwrap().wait(TIMEOUT).unwrap();
+        stop.request();
+        (0..LATE).for_each(|tick| publisher.submit(tick, gnss()));
+        recorder.join().unwrap()
+    })
+}
+
+#[test]
+fn messages_under_way_when_a_recorder_is_asked_to_stop_are_recorded() {
+    let folder = tempfile::tempdir().unwrap();
+    let report = record_late_messages(folder.path().join("late.mcap"));
+    assert!(report.messages >= LATE && report.is_complete(), "{report:?}");
+}
