@@ -11,27 +11,28 @@ const ROUNDS: usize = 25;
 ///
 /// Starts with points far from each other (k-means++, Arthur and Vassilvitskii 2007); same seed, same result.
 #[must_use]
-pub(crate) fn kmeans(points: &[[f64; 3]], count: usize, seed: u64) -> (Vec<[f64; 3]>, Vec<usize>) {
+pub(crate) fn kmeans<const N: usize>(points: &[[f64; N]], count: usize, seed: u64) -> (Vec<[f64; N]>, Vec<usize>) {
     let mut centres = spread(points, count.min(points.len()), seed);
     let mut labels = vec![0; points.len()];
     for _ in 0..ROUNDS {
         labels.iter_mut().zip(points).for_each(|(label, point)| *label = nearest(&centres, point).0);
-        let mut sums = vec![[0.0; 4]; centres.len()];
+        let mut sums = vec![([0.0; N], 0.0); centres.len()];
         for (&label, point) in labels.iter().zip(points) {
-            (0..3).for_each(|axis| sums[label][axis] += point[axis]);
-            sums[label][3] += 1.0;
+            let (sum, count) = &mut sums[label];
+            sum.iter_mut().zip(point).for_each(|(sum, value)| *sum += value);
+            *count += 1.0;
         }
-        for (centre, sum) in centres.iter_mut().zip(&sums).filter(|(_, sum)| sum[3] > 0.0) {
-            *centre = std::array::from_fn(|axis| sum[axis] / sum[3]);
+        for (centre, (sum, count)) in centres.iter_mut().zip(&sums).filter(|(_, (_, count))| *count > 0.0) {
+            *centre = sum.map(|sum| sum / count);
         }
     }
     (centres, labels)
 }
 
-fn spread(points: &[[f64; 3]], count: usize, seed: u64) -> Vec<[f64; 3]> {
+fn spread<const N: usize>(points: &[[f64; N]], count: usize, seed: u64) -> Vec<[f64; N]> {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let mut squares = vec![f64::MAX; points.len()];
-    let mut centres: Vec<[f64; 3]> = Vec::with_capacity(count);
+    let mut centres: Vec<[f64; N]> = Vec::with_capacity(count);
     while centres.len() < count {
         let indices: Vec<usize> = (0..points.len()).collect();
         let weight = |&index: &usize| if centres.is_empty() { 1.0 } else { squares[index] };
@@ -44,13 +45,13 @@ fn spread(points: &[[f64; 3]], count: usize, seed: u64) -> Vec<[f64; 3]> {
     centres
 }
 
-fn nearest(centres: &[[f64; 3]], point: &[f64; 3]) -> (usize, f64) {
+fn nearest<const N: usize>(centres: &[[f64; N]], point: &[f64; N]) -> (usize, f64) {
     let distances = centres.iter().map(|centre| square(centre, point)).enumerate();
     distances.min_by(|a, b| a.1.total_cmp(&b.1)).unwrap_or((0, f64::MAX))
 }
 
-fn square(a: &[f64; 3], b: &[f64; 3]) -> f64 {
-    (0..3).map(|axis| (a[axis] - b[axis]).powi(2)).sum()
+fn square<const N: usize>(a: &[f64; N], b: &[f64; N]) -> f64 {
+    a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum()
 }
 
 #[cfg(test)]
@@ -69,7 +70,7 @@ mod tests {
 
     #[test]
     fn few_or_equal_points_are_valid() {
-        assert_eq!(kmeans(&[], 4, 0).0.len(), 0);
+        assert_eq!(kmeans::<3>(&[], 4, 0).0.len(), 0);
         assert_eq!(kmeans(&[[1.0; 3]; 9], 4, 0).0, [[1.0; 3]; 4]);
     }
 }

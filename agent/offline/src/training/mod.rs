@@ -9,6 +9,7 @@ mod feature_cache;
 mod hypliloc_training;
 mod kmeans;
 mod pairs;
+mod place_classes;
 mod redundancy;
 mod scene_training;
 mod scene_validation;

@@ -55,6 +55,15 @@ impl NoiseSchedule {
         poses.f_mul(&factor(signal)?)?.f_add(&noise.f_mul(&factor(deviation)?)?)
     }
 
+    /// `[W, 1, 1]`: error of the poses that an error of 1 in the noise at steps `[W]` implies.
+    ///
+    /// # Errors
+    /// Those of the tensor library.
+    pub fn implied_error(&self, steps: &Tensor) -> Result<Tensor, TchError> {
+        let [signal, deviation] = &self.factors;
+        deviation.f_div(signal)?.f_index_select(0, steps)?.f_view([-1, 1, 1])
+    }
+
     /// Finds poses from noise in `count` steps without randomness; `predict` returns the noise in poses at a step.
     ///
     /// # Errors
@@ -124,5 +133,20 @@ mod tests {
         let value = |window| noisy.double_value(&[window, 2, 4]);
         assert!((value(0) - (0.9999_f64.sqrt() - 0.01)).abs() < 1e-6);
         assert!(value(1) < -0.9, "{}", value(1));
+    }
+
+    #[test]
+    fn an_error_of_the_noise_is_an_error_of_the_pose_that_it_implies() {
+        let schedule = NoiseSchedule::new(Device::Cpu).unwrap();
+        let steps = Tensor::from_slice(&[5_i64, 60, 99]);
+        let zeros = Tensor::zeros([3, 1, 5], (Kind::Float, Device::Cpu));
+        let ones = zeros.ones_like();
+        let signal = schedule.add_noise(&ones, &zeros, &steps).unwrap();
+        let noisy = schedule.add_noise(&ones, &ones, &steps).unwrap();
+        // Of noise that is found 0.1 too low, 0.1 stay in the pose.
+        let found = schedule.add_noise(&zeros, &(&ones * 0.9), &steps).unwrap();
+        let off = (noisy - found) / signal - 1.0;
+        let implied = schedule.implied_error(&steps).unwrap() * 0.1;
+        assert!(off.allclose(&implied.expand([3, 1, 5], false), 1e-4, 1e-5, false), "{off} {implied}");
     }
 }

@@ -30,7 +30,7 @@ mod sweep_input;
 pub use config::HypLiLocConfig;
 pub use groups::Groups;
 pub use localizer::HypLiLocLocalizer;
-pub use network::{BranchPoses, HypLiLoc};
+pub use network::{BranchPoses, HypLiLoc, WIDTH};
 pub use pose_head::NormalisedPoses;
 pub use range_image::{COLUMNS, ROWS, roll_columns};
 pub use sweep_input::{InputBatch, POINTS, RANGE_M, SweepInput};

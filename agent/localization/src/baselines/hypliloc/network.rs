@@ -13,11 +13,13 @@ use super::pose_head::{NormalisedPoses, PoseHead};
 use super::sweep_input::InputBatch;
 
 /// Channels of a token.
-pub(super) const WIDTH: i64 = 256;
+pub const WIDTH: i64 = 256;
 
 /// Poses from the tokens of each branch.
 #[derive(Debug)]
 pub struct BranchPoses {
+    /// `[S, WIDTH]`: means of the fused tokens, from which the last pose comes.
+    pub features: Tensor,
     /// From points alone.
     pub points: NormalisedPoses,
     /// From the image alone.
@@ -85,6 +87,7 @@ impl HypLiLoc {
             points: point_head.forward(&points)?,
             image: image_head.forward(&image)?,
             fusion: fusion_head.forward(&fused)?,
+            features: fused.f_mean_dim(1_i64, false, Kind::Float)?,
         })
     }
 }

@@ -26,7 +26,7 @@ pub(super) struct SweepImages {
     /// `[S, STORED_CHANNELS, rows, columns]`, half precision.
     images: Tensor,
     /// `[S, 5]`: position in deviations from the origin, cosine and sine of the heading.
-    poses: Tensor,
+    pub(super) poses: Tensor,
     /// `[S]`: number of the first sweep of the same drive.
     first_of_drive: Tensor,
     pub(super) normalisation: Normalisation,

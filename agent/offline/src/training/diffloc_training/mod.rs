@@ -14,6 +14,7 @@ use tch::nn::VarStore;
 use tch::{Cuda, Device, Tensor};
 
 use super::error::LocalizerTrainError;
+use super::place_classes::PlaceClasses;
 use super::sweep_store::SweepList;
 use localization::baselines::diffloc::{DiffLoc, DiffLocConfig, DiffLocLocalizer};
 use perception::train::{RunConfig, Trained, Trainer};
@@ -113,8 +114,10 @@ pub fn train_diffloc(
     let network_config = DiffLocConfig { origin_m, scale_m, ..config.network.clone() };
     let variables = VarStore::new(run.device);
     let network = DiffLoc::new(&variables.root(), &network_config)?;
+    let places = variables.root() / "places";
+    let places = PlaceClasses::new(&places, network_config.width, &images.poses, scale_m, run.seed)?;
     let trainer = Trainer::begin(run, &variables, None, started)?;
-    let mut training = Training { config, network, variables, images, validation, trainer, last: None };
+    let mut training = Training { config, network, places, variables, images, validation, trainer, last: None };
     training.run(observe)?;
     let about = BTreeMap::from([
         (CONFIG_KEY.to_owned(), serde_json::to_string(&network_config).expect("a configuration is JSON")),
@@ -132,6 +135,7 @@ pub fn train_diffloc(
 struct Training<'a> {
     config: &'a DiffLocTrainConfig,
     network: DiffLoc,
+    places: PlaceClasses,
     variables: VarStore,
     images: SweepImages,
     validation: Option<SweepImages>,
@@ -175,7 +179,7 @@ impl Training<'_> {
 
     /// Order, augmentation and noise follow from seed and step, so a resumed training is the uninterrupted one.
     fn step(&mut self) -> Result<StepLosses, LocalizerTrainError> {
-        let Self { config, network, images, .. } = self;
+        let Self { config, network, places, images, .. } = self;
         let run = &config.run;
         tch::manual_seed(run.seed.wrapping_shl(32).wrapping_add(self.trainer.steps()) as i64);
         let frames = config.network.frames;
@@ -186,7 +190,7 @@ impl Training<'_> {
             shift_m: config.shift_m,
         };
         let batch = augmentation.apply(&windows, frames, &images.normalisation)?;
-        let losses = losses(network, &batch, frames, run.precision.kind())?;
+        let losses = losses(network, places, &batch, frames, run.precision.kind())?;
         let share_done = self.share_done();
         self.trainer.step(&losses.total, share_done)?;
         Ok(StepLosses { noise: losses.noise, features: losses.features.f_flatten(0, 1)?, poses: batch.poses })

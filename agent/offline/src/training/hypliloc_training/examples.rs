@@ -91,6 +91,11 @@ impl Examples {
         self.inputs.len()
     }
 
+    /// `[S, 5]`: position and heading of all sweeps.
+    pub(super) fn poses(&self) -> Result<Tensor, TchError> {
+        self.truth.poses()
+    }
+
     /// Random sweeps.
     pub(super) fn draw(&self, count: i64) -> Result<(InputBatch, Truth), TchError> {
         let rows = Tensor::f_randint(self.len(), [count], (Kind::Int64, self.scale_m.device()))?;
@@ -112,6 +117,11 @@ impl Truth {
         }
         let tensor = |values: &[f32], columns: i64| Tensor::f_from_slice(values)?.f_view([-1, columns]);
         Ok(Self { position: tensor(&positions, 3)?, heading: tensor(&headings, 2)? })
+    }
+
+    /// `[S, 5]`: position and heading.
+    pub(super) fn poses(&self) -> Result<Tensor, TchError> {
+        Tensor::f_cat(&[&self.position, &self.heading], 1)
     }
 
     fn to_device(&self, device: tch::Device) -> Result<Self, TchError> {

@@ -12,8 +12,9 @@ use tch::nn::VarStore;
 use tch::{Cuda, Kind, Tensor};
 
 use super::error::LocalizerTrainError;
+use super::place_classes::PlaceClasses;
 use localization::baselines::HypLiLocLocalizer;
-use localization::baselines::hypliloc::{HypLiLoc, HypLiLocConfig};
+use localization::baselines::hypliloc::{HypLiLoc, HypLiLocConfig, WIDTH};
 use perception::train::{RunConfig, Trained, Trainer};
 use perception::weights::{CONFIG_KEY, KIND_KEY};
 
@@ -21,6 +22,8 @@ use augmentation::augment;
 use criterion::{Criteria, mean_errors};
 use examples::Examples;
 
+/// Weight of the classification of places.
+const PLACE_WEIGHT: f64 = 0.5;
 /// Steps between two reports.
 const REPORT_EVERY: u64 = 20;
 /// Steps between two checkpoints.
@@ -73,6 +76,8 @@ pub fn train_hypliloc(
     let variables = VarStore::new(run.device);
     let network = HypLiLoc::new(&variables.root());
     let criteria = Criteria::new(&(variables.root() / "criteria"));
+    let places = variables.root() / "places";
+    let places = PlaceClasses::new(&places, WIDTH, &examples.poses()?, examples.deviation_m, run.seed)?;
     let mut trainer = Trainer::begin(run, &variables, None, Instant::now())?;
     // The tensor library draws all random numbers of a step, on the device.
     tch::manual_seed(run.seed.wrapping_add(trainer.steps()) as i64);
@@ -84,7 +89,7 @@ pub fn train_hypliloc(
     while share_done(&trainer) < 1.0 {
         let (batch, truth) = augment(examples.draw(run.batch as i64)?, config.turn_rad)?;
         let poses = network.forward(&batch, run.precision.kind(), true)?;
-        let loss = criteria.loss(&poses, &truth)?;
+        let loss = criteria.loss(&poses, &truth)? + places.loss(&poses.features, &truth.poses()?)? * PLACE_WEIGHT;
         trainer.step(&loss, share_done(&trainer))?;
         trainer.check_interruption(&variables)?;
         errors += mean_errors(&poses.fusion, &truth, &examples.scale_m)?;

@@ -1,0 +1,111 @@
+//! Place classes: a loss of networks that regress poses, by which their features learn to tell places apart.
+//!
+//! The published networks begin with the weights of large collections of images; from random weights the regression alone
+//! hardly leaves the mean pose in a training of some passes. Not in their papers, and not part of the trained network.
+
+use tch::nn::{self, LinearConfig, Module};
+use tch::{Kind, Reduction, TchError, Tensor};
+
+use super::kmeans::kmeans;
+
+/// Number of classes.
+const CLASSES: usize = 256;
+/// Distance that a turn by 60 degrees counts as, metres: opposite lanes are different classes.
+const HEADING_M: f64 = 15.0;
+/// Label smoothing, as in LightLoc's classifier.
+const LABEL_SMOOTHING: f64 = 0.1;
+
+/// Classifier of features by the nearest of some training poses.
+pub(super) struct PlaceClasses {
+    layer: nn::Linear,
+    /// `[5]`: metres of each number of a pose.
+    units_m: Tensor,
+    /// `[classes, 5]`, metres.
+    centres_m: Tensor,
+}
+
+impl PlaceClasses {
+    /// Clusters training poses `[S, 5]` (position in units of `scale_m`, cosine and sine of the heading), and builds a
+    /// layer for features of `width` channels below `path`.
+    ///
+    /// # Errors
+    /// Those of the tensor library.
+    pub(super) fn new(
+        path: &nn::Path<'_>,
+        width: i64,
+        poses: &Tensor,
+        scale_m: [f64; 3],
+        seed: u64,
+    ) -> Result<Self, TchError> {
+        let units_m = scale_m.into_iter().chain([HEADING_M; 2]).map(|unit| unit as f32).collect::<Vec<f32>>();
+        let units_m = Tensor::f_from_slice(&units_m)?.f_to_device(path.device())?;
+        let rows: Vec<f64> = Vec::try_from(&poses.f_mul(&units_m)?.f_to_kind(Kind::Double)?.f_reshape([-1])?)?;
+        let (rows, _) = rows.as_chunks::<5>();
+        let (centres, _) = kmeans(rows, CLASSES, seed);
+        let centres_m = Tensor::f_from_slice(centres.as_flattened())?.f_to_kind(Kind::Float)?.f_view([-1, 5])?;
+        let layer = nn::linear(path, width, centres.len() as i64, LinearConfig::default());
+        Ok(Self { layer, units_m, centres_m: centres_m.f_to_device(path.device())? })
+    }
+
+    /// Cross entropy of features `[N, width]` of sweeps with `poses` `[N, 5]`.
+    ///
+    /// # Errors
+    /// Those of the tensor library.
+    pub(super) fn loss(&self, features: &Tensor, poses: &Tensor) -> Result<Tensor, TchError> {
+        let logits = self.layer.forward(features);
+        let weight = None::<Tensor>;
+        logits.f_cross_entropy_loss(&self.classes(poses)?, weight, Reduction::Mean, -100, LABEL_SMOOTHING)
+    }
+
+    /// `[N]`: the nearest centre of each of `poses` `[N, 5]`.
+    fn classes(&self, poses: &Tensor) -> Result<Tensor, TchError> {
+        Tensor::f_cdist(&poses.f_mul(&self.units_m)?, &self.centres_m, 2.0, None)?.f_argmin(1, false)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use tch::Device;
+    use tch::nn::VarStore;
+
+    use super::*;
+
+    /// Four poses: two places, in both directions of each.
+    fn poses() -> Tensor {
+        let rows: [[f32; 5]; 4] = [
+            [0.0, 0.0, 0.0, 1.0, 0.0],
+            [0.0, 0.0, 0.0, -1.0, 0.0],
+            [1.0, 0.5, 0.0, 0.0, 1.0],
+            [1.0, 0.5, 0.0, 0.0, -1.0],
+        ];
+        Tensor::from_slice(rows.as_flattened()).view([4, 5])
+    }
+
+    #[test]
+    fn places_and_directions_are_classes_of_their_own() {
+        let variables = VarStore::new(Device::Cpu);
+        let classes = PlaceClasses::new(&variables.root(), 8, &poses(), [100.0, 100.0, 1.0], 0).unwrap();
+        let found: Vec<i64> = Vec::try_from(classes.classes(&poses()).unwrap()).unwrap();
+        let mut sorted = found.clone();
+        sorted.sort_unstable();
+        assert_eq!(sorted, [0, 1, 2, 3]);
+        // 3 m and 10 degrees away.
+        let (sine, cosine) = 10f32.to_radians().sin_cos();
+        let near = Tensor::from_slice(&[0.03f32, 0.0, 0.0, cosine, sine]).view([1, 5]);
+        assert_eq!(Vec::<i64>::try_from(classes.classes(&near).unwrap()).unwrap(), found[..1]);
+    }
+
+    #[test]
+    fn features_that_tell_the_class_have_a_small_loss() {
+        let variables = VarStore::new(Device::Cpu);
+        let classes = PlaceClasses::new(&variables.root(), 4, &poses(), [100.0, 100.0, 1.0], 0).unwrap();
+        let own = classes.classes(&poses()).unwrap().one_hot(4).to_kind(Kind::Float);
+        tch::no_grad(|| {
+            let named = variables.variables();
+            named["weight"].shallow_clone().copy_(&(Tensor::eye(4, (Kind::Float, Device::Cpu)) * 20.0));
+            let _ = named["bias"].shallow_clone().zero_();
+        });
+        let loss = |features: &Tensor| classes.loss(features, &poses()).unwrap().double_value(&[]);
+        assert!(loss(&own) + 3.0 < loss(&own.roll([1], [0])), "{} {}", loss(&own), loss(&own.roll([1], [0])));
+    }
+}
