@@ -1,4 +1,4 @@
-//! Denoiser: predicts the noise in the poses of the sweeps of a window from their features.
+//! Denoiser: predicts the velocity of noisy poses of the sweeps of a window from their features.
 
 use tch::nn;
 use tch::{Device, Kind, TchError, Tensor};
@@ -71,7 +71,7 @@ impl PoseDenoiser {
         })
     }
 
-    /// Noise `[W, F, POSE]` in `poses` of the same shape at steps `[W]`, from the features `[W, F, width]` of their
+    /// Velocity `[W, F, POSE]` of noisy `poses` of the same shape at steps `[W]`, from the features `[W, F, width]` of their
     /// sweeps, oldest first; single precision throughout.
     ///
     /// # Errors

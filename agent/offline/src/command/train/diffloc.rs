@@ -86,8 +86,12 @@ impl Args {
 fn show(bar: &TrainingBar, report: &DiffLocReport) {
     match report {
         DiffLocReport::Imaging(done, total) => bar.encoded(*done, *total),
-        DiffLocReport::Stepped { step, share_done, seconds, noise_l1, accuracy } => {
-            bar.report(*share_done, *seconds, &format!("step {step} noise {noise_l1:.4}, batch {}", text(accuracy)));
+        DiffLocReport::Stepped { step, share_done, seconds, velocity_l1, accuracy } => {
+            bar.report(
+                *share_done,
+                *seconds,
+                &format!("step {step} velocity {velocity_l1:.4}, batch {}", text(accuracy)),
+            );
         }
         DiffLocReport::Validated(seconds, accuracy) => {
             bar.print_line(&format!("{seconds:.0} s: validation {}", text(accuracy)));

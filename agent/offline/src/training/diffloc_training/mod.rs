@@ -31,7 +31,7 @@ const REPORT_EVERY: u64 = 50;
 /// Steps between two checkpoints and validations.
 const CHECKPOINT_EVERY: u64 = 1000;
 /// Columns of the training curve.
-const CURVE: &str = "step,seconds,noise_l1,p50_m,success_3m,validation_p50_m,validation_success_3m";
+const CURVE: &str = "step,seconds,velocity_l1,p50_m,success_3m,validation_p50_m,validation_success_3m";
 
 /// Configuration of a training of DiffLoc.
 #[derive(Debug, Clone)]
@@ -63,8 +63,8 @@ pub enum DiffLocReport {
         share_done: f64,
         /// Seconds spent.
         seconds: f64,
-        /// Mean L1 of the noise since the last report.
-        noise_l1: f64,
+        /// Mean L1 of the velocity since the last report.
+        velocity_l1: f64,
         /// Accuracy on the last batch.
         accuracy: DiffLocAccuracy,
     },
@@ -147,26 +147,26 @@ struct Training<'a> {
 impl Training<'_> {
     fn run(&mut self, observe: &mut dyn FnMut(&DiffLocReport)) -> Result<(), LocalizerTrainError> {
         let mut curve = self.trainer.curve(CURVE)?;
-        let mut noise = Vec::new();
+        let mut velocity = Vec::new();
         while self.share_done() < 1.0 {
             let losses = self.step()?;
             self.trainer.check_interruption(&self.variables)?;
-            noise.push(losses.noise);
+            velocity.push(losses.velocity);
             let step = self.trainer.steps();
             if self.trainer.is_report_due(REPORT_EVERY) || self.share_done() >= 1.0 {
-                let noise_l1 = Tensor::f_stack(&noise, 0)?.f_mean(None)?.f_double_value(&[])?;
-                noise.clear();
+                let velocity_l1 = Tensor::f_stack(&velocity, 0)?.f_mean(None)?.f_double_value(&[])?;
+                velocity.clear();
                 let seconds = self.trainer.seconds();
                 let accuracy = accuracy(&self.network, &losses.features, &losses.poses, &self.images.normalisation)?;
                 let share_done = self.share_done().min(1.0);
-                observe(&DiffLocReport::Stepped { step, share_done, seconds, noise_l1, accuracy });
+                observe(&DiffLocReport::Stepped { step, share_done, seconds, velocity_l1, accuracy });
                 if step.is_multiple_of(CHECKPOINT_EVERY) || share_done >= 1.0 {
                     self.trainer.checkpoint(&self.variables)?;
                     self.validate(observe)?;
                 }
                 let of = |accuracy: DiffLocAccuracy| [accuracy.p50_m, accuracy.success_3m];
                 let validated = self.last.map_or([f64::NAN; 2], of);
-                curve.numbers(&[&[step as f64, seconds, noise_l1], &of(accuracy)[..], &validated].concat())?;
+                curve.numbers(&[&[step as f64, seconds, velocity_l1], &of(accuracy)[..], &validated].concat())?;
             }
         }
         Ok(())
@@ -193,7 +193,7 @@ impl Training<'_> {
         let losses = losses(network, places, &batch, frames, run.precision.kind())?;
         let share_done = self.share_done();
         self.trainer.step(&losses.total, share_done)?;
-        Ok(StepLosses { noise: losses.noise, features: losses.features.f_flatten(0, 1)?, poses: batch.poses })
+        Ok(StepLosses { velocity: losses.velocity, features: losses.features.f_flatten(0, 1)?, poses: batch.poses })
     }
 
     fn validate(&mut self, observe: &mut dyn FnMut(&DiffLocReport)) -> Result<(), LocalizerTrainError> {
@@ -208,7 +208,7 @@ impl Training<'_> {
 
 /// A step's loss and sweeps, on the device.
 struct StepLosses {
-    noise: Tensor,
+    velocity: Tensor,
     /// `[N, width]`.
     features: Tensor,
     /// `[N, 5]`.
