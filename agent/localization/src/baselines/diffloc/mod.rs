@@ -6,7 +6,8 @@
 //!
 //! Departures from the paper: a transformer of six layers of 192 channels with random weights at the start, where the
 //! paper has a foundation model of 21 million parameters; a denoiser of three layers; cosine and sine of the heading in
-//! place of a quaternion's logarithm, since vehicles head in all directions and stand upright; the denoiser predicts the velocity between pose and noise instead of
+//! place of a quaternion's logarithm, since vehicles head in all directions and stand upright; features
+//! are normalised over the batch; the denoiser predicts the velocity between pose and noise instead of
 //! the noise, whose errors count twelve times in the pose at the last step.
 
 mod config;

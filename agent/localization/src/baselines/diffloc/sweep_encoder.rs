@@ -1,5 +1,6 @@
 //! Encoder of sweeps: range images to one feature each, with a mask of static objects.
 
+use perception::layers::convolution::Norm;
 use tch::nn::{self, Init};
 use tch::{Kind, TchError, Tensor};
 
@@ -11,6 +12,8 @@ use crate::pgc::dense::Dense;
 
 /// Channels of the perceptrons, relative to those of a token.
 const EXPANSION: i64 = 4;
+/// Epsilon and momentum of the norm of features.
+const FEATURE_NORM: (f64, f64) = (1e-5, 0.1);
 
 /// Stem, transformer and static-object-aware pooling.
 #[derive(Debug)]
@@ -20,6 +23,7 @@ pub struct SweepEncoder {
     layers: Vec<TransformerLayer>,
     norm: LayerNorm,
     mask: Dense,
+    feature_norm: Norm,
 }
 
 /// Encoded range images.
@@ -46,6 +50,7 @@ impl SweepEncoder {
             layers: (0..layers).map(layer).collect(),
             norm: LayerNorm::new(&(path / "norm"), width),
             mask: Dense::new(&(path / "mask"), width, 1, 0.1),
+            feature_norm: Norm::with_eps(&(path / "feature_norm"), width, FEATURE_NORM.0, FEATURE_NORM.1),
         }
     }
 
@@ -61,8 +66,10 @@ impl SweepEncoder {
         let x = self.norm.forward(&x)?.f_to_kind(Kind::Float)?;
         let logits = dense(&self.mask, &x)?;
         let weighted = x.f_add(&x.f_mul(&logits.f_sigmoid()?)?)?;
+        let features = weighted.f_mean_dim(1_i64, false, Kind::Float)?;
         Ok(EncodedSweeps {
-            features: weighted.f_mean_dim(1_i64, false, Kind::Float)?,
+            // Means over tokens are nearly the same for all sweeps.
+            features: self.feature_norm.forward(&features, train),
             static_logits: logits.f_squeeze_dim(2)?,
         })
     }

@@ -9,7 +9,7 @@
 //!
 //! Departures: the heading is a cosine and a sine instead of a log-quaternion, since vehicles head in all directions; the image has the channels x, y, z and range, for the mean of tokens would not tell a direction otherwise; a
 //! head of the attention has a ball of its own and returns from it by the logarithm before the layer norm; the learnt
-//! metric begins as the identity.
+//! metric begins as the identity; heads normalise the means of tokens over the batch.
 
 mod config;
 mod dense_norm;

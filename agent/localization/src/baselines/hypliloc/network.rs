@@ -18,7 +18,7 @@ pub const WIDTH: i64 = 256;
 /// Poses from the tokens of each branch.
 #[derive(Debug)]
 pub struct BranchPoses {
-    /// `[S, WIDTH]`: means of the fused tokens, from which the last pose comes.
+    /// `[S, WIDTH]`: features of the fusion, from which its pose comes.
     pub features: Tensor,
     /// From points alone.
     pub points: NormalisedPoses,
@@ -83,11 +83,12 @@ impl HypLiLoc {
         let fused = self.second.forward(&fused_points, &tokens_of(&fused_map)?)?;
 
         let [point_head, image_head, fusion_head] = &self.heads;
+        let features = fusion_head.features(&fused, train)?;
         Ok(BranchPoses {
-            points: point_head.forward(&points)?,
-            image: image_head.forward(&image)?,
-            fusion: fusion_head.forward(&fused)?,
-            features: fused.f_mean_dim(1_i64, false, Kind::Float)?,
+            points: point_head.forward(&point_head.features(&points, train)?)?,
+            image: image_head.forward(&image_head.features(&image, train)?)?,
+            fusion: fusion_head.forward(&features)?,
+            features,
         })
     }
 }

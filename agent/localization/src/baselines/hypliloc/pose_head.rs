@@ -1,10 +1,14 @@
 //! Head of a branch: position and heading from the mean of its tokens.
 
+use perception::layers::convolution::Norm;
 use tch::nn;
 use tch::{Kind, TchError, Tensor};
 
 use super::network::WIDTH;
 use crate::pgc::dense::Dense;
+
+/// Epsilon and momentum of the norm of features.
+const NORM: (f64, f64) = (1e-5, 0.1);
 
 /// Poses as the network states them.
 #[derive(Debug)]
@@ -18,6 +22,7 @@ pub struct NormalisedPoses {
 /// Layers from the mean token to a pose.
 #[derive(Debug)]
 pub(super) struct PoseHead {
+    norm: Norm,
     position: [Dense; 3],
     heading: [Dense; 3],
 }
@@ -29,17 +34,25 @@ impl PoseHead {
             let layer = |number: usize, from, to, gain| Dense::new(&(path / name / number), from, to, gain);
             [layer(0, WIDTH, 128, 1.0), layer(1, 128, 64, 1.0), layer(2, 64, outputs, 0.1)]
         };
-        Self { position: chain("position", 3), heading: chain("heading", 2) }
+        let norm = Norm::with_eps(&(path / "norm"), WIDTH, NORM.0, NORM.1);
+        Self { norm, position: chain("position", 3), heading: chain("heading", 2) }
     }
 
-    /// Poses from the mean of tokens `[S, T, WIDTH]`.
+    /// `[S, WIDTH]`: means of tokens `[S, T, WIDTH]`, which are nearly the same for all sweeps, normalised over the batch.
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub(super) fn forward(&self, tokens: &Tensor) -> Result<NormalisedPoses, TchError> {
-        let mean = tokens.f_mean_dim(1_i64, false, Kind::Float)?;
+    pub(super) fn features(&self, tokens: &Tensor, train: bool) -> Result<Tensor, TchError> {
+        Ok(self.norm.forward(&tokens.f_mean_dim(1_i64, false, Kind::Float)?, train))
+    }
+
+    /// Poses from features `[S, WIDTH]`.
+    ///
+    /// # Errors
+    /// Those of the tensor library.
+    pub(super) fn forward(&self, features: &Tensor) -> Result<NormalisedPoses, TchError> {
         let through = |[first, second, third]: &[Dense; 3]| {
-            third.forward(&second.forward(&first.forward(&mean)?.f_relu()?)?.f_relu()?)
+            third.forward(&second.forward(&first.forward(features)?.f_relu()?)?.f_relu()?)
         };
         Ok(NormalisedPoses { position: through(&self.position)?, heading: through(&self.heading)? })
     }

@@ -24,6 +24,8 @@ pub(super) struct Losses {
     pub(super) total: Tensor,
     /// Mean L1 of the velocity, without gradient.
     pub(super) velocity: Tensor,
+    /// Cross entropy of places, without gradient.
+    pub(super) place: Tensor,
     /// `[W, F, width]`: features of the sweeps, without gradient.
     pub(super) features: Tensor,
 }
@@ -44,8 +46,8 @@ pub(super) fn losses(
     let place = places.loss(&encoded.features, &batch.poses)?;
     let features = encoded.features.f_view([-1, frames, network.config().width])?;
     let [velocity, differences] = velocity_losses(network, &features, &batch.poses.f_view([-1, frames, 5])?)?;
-    let total = &velocity + differences * DIFFERENCE_WEIGHT + mask * MASK_WEIGHT + place * PLACE_WEIGHT;
-    Ok(Losses { total, velocity: velocity.f_detach()?, features: features.f_detach()? })
+    let total = &velocity + differences * DIFFERENCE_WEIGHT + mask * MASK_WEIGHT + &place * PLACE_WEIGHT;
+    Ok(Losses { total, velocity: velocity.f_detach()?, place: place.f_detach()?, features: features.f_detach()? })
 }
 
 /// L1 of the velocity, and of its differences between sweeps that see each other.

@@ -11,7 +11,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use tch::nn::VarStore;
-use tch::{Cuda, Device, Tensor};
+use tch::{Cuda, Device, Kind, Tensor};
 
 use super::error::LocalizerTrainError;
 use super::place_classes::PlaceClasses;
@@ -31,7 +31,7 @@ const REPORT_EVERY: u64 = 50;
 /// Steps between two checkpoints and validations.
 const CHECKPOINT_EVERY: u64 = 1000;
 /// Columns of the training curve.
-const CURVE: &str = "step,seconds,velocity_l1,p50_m,success_3m,validation_p50_m,validation_success_3m";
+const CURVE: &str = "step,seconds,velocity_l1,place_loss,p50_m,success_3m,validation_p50_m,validation_success_3m";
 
 /// Configuration of a training of DiffLoc.
 #[derive(Debug, Clone)]
@@ -65,6 +65,8 @@ pub enum DiffLocReport {
         seconds: f64,
         /// Mean L1 of the velocity since the last report.
         velocity_l1: f64,
+        /// Mean cross entropy of places since the last report.
+        place_loss: f64,
         /// Accuracy on the last batch.
         accuracy: DiffLocAccuracy,
     },
@@ -147,26 +149,29 @@ struct Training<'a> {
 impl Training<'_> {
     fn run(&mut self, observe: &mut dyn FnMut(&DiffLocReport)) -> Result<(), LocalizerTrainError> {
         let mut curve = self.trainer.curve(CURVE)?;
-        let mut velocity = Vec::new();
+        let mut means = Vec::new();
         while self.share_done() < 1.0 {
             let losses = self.step()?;
             self.trainer.check_interruption(&self.variables)?;
-            velocity.push(losses.velocity);
+            means.push(losses.means);
             let step = self.trainer.steps();
             if self.trainer.is_report_due(REPORT_EVERY) || self.share_done() >= 1.0 {
-                let velocity_l1 = Tensor::f_stack(&velocity, 0)?.f_mean(None)?.f_double_value(&[])?;
-                velocity.clear();
+                let mean = Tensor::f_stack(&means, 0)?.f_mean_dim(0_i64, false, Kind::Double)?;
+                let (velocity_l1, place_loss) = (mean.f_double_value(&[0])?, mean.f_double_value(&[1])?);
+                means.clear();
                 let seconds = self.trainer.seconds();
                 let accuracy = accuracy(&self.network, &losses.features, &losses.poses, &self.images.normalisation)?;
                 let share_done = self.share_done().min(1.0);
-                observe(&DiffLocReport::Stepped { step, share_done, seconds, velocity_l1, accuracy });
+                observe(&DiffLocReport::Stepped { step, share_done, seconds, velocity_l1, place_loss, accuracy });
                 if step.is_multiple_of(CHECKPOINT_EVERY) || share_done >= 1.0 {
                     self.trainer.checkpoint(&self.variables)?;
                     self.validate(observe)?;
                 }
                 let of = |accuracy: DiffLocAccuracy| [accuracy.p50_m, accuracy.success_3m];
                 let validated = self.last.map_or([f64::NAN; 2], of);
-                curve.numbers(&[&[step as f64, seconds, velocity_l1], &of(accuracy)[..], &validated].concat())?;
+                curve.numbers(
+                    &[&[step as f64, seconds, velocity_l1, place_loss], &of(accuracy)[..], &validated].concat(),
+                )?;
             }
         }
         Ok(())
@@ -193,7 +198,8 @@ impl Training<'_> {
         let losses = losses(network, places, &batch, frames, run.precision.kind())?;
         let share_done = self.share_done();
         self.trainer.step(&losses.total, share_done)?;
-        Ok(StepLosses { velocity: losses.velocity, features: losses.features.f_flatten(0, 1)?, poses: batch.poses })
+        let means = Tensor::f_stack(&[losses.velocity, losses.place], 0)?;
+        Ok(StepLosses { means, features: losses.features.f_flatten(0, 1)?, poses: batch.poses })
     }
 
     fn validate(&mut self, observe: &mut dyn FnMut(&DiffLocReport)) -> Result<(), LocalizerTrainError> {
@@ -208,7 +214,8 @@ impl Training<'_> {
 
 /// A step's loss and sweeps, on the device.
 struct StepLosses {
-    velocity: Tensor,
+    /// `[2]`: L1 of the velocity, cross entropy of places.
+    means: Tensor,
     /// `[N, width]`.
     features: Tensor,
     /// `[N, 5]`.
