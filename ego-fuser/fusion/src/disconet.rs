@@ -26,9 +26,6 @@ pub static METHOD: MethodSpec = MethodSpec {
     fusion: FusionSpec::of::<DiscoNetConfig>(),
 };
 
-/// Batch norm of the reference: PyTorch's defaults.
-const NORM: (f64, f64) = (1e-5, 0.1);
-
 /// Sizes of [`DiscoNet`].
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -92,7 +89,7 @@ impl DiscoNet {
         let path = path / "pixel_weight_layer";
         let [first, second, third] = config.hidden;
         let layer = |index: usize, io: [i64; 2]| {
-            let norm = Norm::with_eps(&(&path / format!("bn1_{index}")), io[1], NORM.0, NORM.1);
+            let norm = Norm::with_defaults(&(&path / format!("bn1_{index}")), io[1]);
             (Conv::new(&(&path / format!("conv1_{index}")), io, 1), norm)
         };
         Ok(Self {

@@ -2,22 +2,15 @@
 
 use bus::shutdown::Stop;
 use bus::{Barrier, PublisherOptions, Route};
-use protocol::{Gnss, GnssSource, Pose, Topic};
+use protocol::Topic;
 use recording::RecordingOptions;
 use sim_replay::recorder::{self, RecordReport, RecorderOptions};
 use tests::bus::{TIMEOUT, TestRouter};
 
+use super::sessions::gnss;
+
 /// Messages that are published once the recorder is asked to stop.
 const LATE: u64 = 20;
-
-fn gnss() -> Gnss {
-    Gnss {
-        world_from_lidar: Pose::from_xyz_yaw([1.0, 2.0, 0.0], 0.0),
-        position_std_m: 0.0,
-        heading_std_rad: 0.0,
-        source: GnssSource::Recorded,
-    }
-}
 
 /// Records what is published after the request to stop.
 fn record_late_messages(out: std::path::PathBuf) -> RecordReport {
@@ -33,7 +26,7 @@ fn record_late_messages(out: std::path::PathBuf) -> RecordReport {
         let route = Route { topic, receiver: "recorder".parse().unwrap() };
         Barrier::new([route]).await_routes(&replay).unwrap().wait(TIMEOUT).unwrap();
         stop.request();
-        (0..LATE).for_each(|tick| publisher.submit(tick, gnss()));
+        (0..LATE).for_each(|tick| publisher.submit(tick, gnss(tick as f64)));
         recorder.join().unwrap()
     })
 }

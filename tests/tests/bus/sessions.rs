@@ -24,7 +24,7 @@ fn topic(text: &str) -> Topic {
     text.parse().unwrap()
 }
 
-fn gnss(x_m: f64) -> Gnss {
+pub(super) fn gnss(x_m: f64) -> Gnss {
     Gnss {
         world_from_lidar: Pose::from_xyz_yaw([x_m, 0.0, 0.0], 0.0),
         position_std_m: 0.0,

@@ -226,7 +226,7 @@ impl Classifier {
     fn new(path: &nn::Path<'_>, inputs: i64, classes: i64) -> Self {
         let [first, second] = CLASSIFIER_WIDTHS;
         let linear = |layer: usize, from, to| nn::linear(path / layer, from, to, LinearConfig::default());
-        let norm = |layer: usize, width| Norm::with_eps(&(path / "norms" / layer), width, 1e-5, 0.1);
+        let norm = |layer: usize, width| Norm::with_defaults(&(path / "norms" / layer), width);
         Self {
             layers: [linear(0, inputs, first), linear(1, first, second)],
             norms: [norm(0, first), norm(1, second)],

@@ -1,7 +1,7 @@
-//! Place classes: a loss of networks that regress poses, by which their features learn to tell places apart.
+//! Place classes: an auxiliary classification loss for networks that regress poses from random weights.
 //!
-//! The published networks begin with the weights of large collections of images; from random weights the regression alone
-//! hardly leaves the mean pose in a training of some passes. Not in their papers, and not part of the trained network.
+//! The published networks are pretrained on large image collections. Not in their papers; the classifier is not used for
+//! localization.
 
 use tch::nn::{self, LinearConfig, Module};
 use tch::{Kind, Reduction, TchError, Tensor};
@@ -10,7 +10,7 @@ use super::kmeans::kmeans;
 
 /// Number of classes.
 const CLASSES: usize = 256;
-/// Distance that a turn by 60 degrees counts as, metres: opposite lanes are different classes.
+/// Distance of two headings 60 degrees apart, metres: opposite lanes are different classes.
 const HEADING_M: f64 = 15.0;
 /// Label smoothing, as in LightLoc's classifier.
 const LABEL_SMOOTHING: f64 = 0.1;

@@ -30,6 +30,12 @@ impl Norm {
         Self::with_eps(path, channels, NORM_EPS, NORM_MOMENTUM)
     }
 
+    /// A batch norm with the epsilon and momentum that PyTorch has by default.
+    #[must_use]
+    pub fn with_defaults(path: &nn::Path<'_>, channels: i64) -> Self {
+        Self::with_eps(path, channels, 1e-5, 0.1)
+    }
+
     /// A batch norm with another epsilon and momentum.
     #[must_use]
     pub fn with_eps(path: &nn::Path<'_>, channels: i64, eps: f64, momentum: f64) -> Self {

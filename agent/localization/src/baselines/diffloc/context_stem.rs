@@ -8,9 +8,6 @@ use super::config::DiffLocConfig;
 use super::range_image::CHANNELS;
 use crate::pgc::dense::Dense;
 
-/// Epsilon and momentum of the batch norms.
-const NORM: (f64, f64) = (1e-5, 0.1);
-
 /// A convolution that keeps the size, with a leaky rectifier.
 #[derive(Debug)]
 struct Convolution {
@@ -47,10 +44,9 @@ struct ContextBlock {
 
 impl ContextBlock {
     fn new(path: &nn::Path<'_>, inputs: i64, outputs: i64) -> Self {
-        let (eps, momentum) = NORM;
         let normed = |name: &str, dilation| {
             let below = path / name;
-            let norm = Norm::with_eps(&(&below / "norm"), outputs, eps, momentum);
+            let norm = Norm::with_defaults(&(&below / "norm"), outputs);
             (Convolution::new(&below, [outputs, outputs], 3, dilation), norm)
         };
         Self {

@@ -71,8 +71,8 @@ impl PoseDenoiser {
         })
     }
 
-    /// Velocity `[W, F, POSE]` of noisy `poses` of the same shape at steps `[W]`, from the features `[W, F, width]` of their
-    /// sweeps, oldest first; single precision throughout.
+    /// Velocity `[W, F, POSE]` of noisy `poses` of the same shape at steps `[W]`, from the features `[W, F, width]` of
+    /// their sweeps, oldest first; single precision throughout.
     ///
     /// # Errors
     /// Those of the tensor library.

@@ -12,8 +12,6 @@ use crate::pgc::dense::Dense;
 
 /// Channels of the perceptrons, relative to those of a token.
 const EXPANSION: i64 = 4;
-/// Epsilon and momentum of the norm of features.
-const FEATURE_NORM: (f64, f64) = (1e-5, 0.1);
 
 /// Stem, transformer and static-object-aware pooling.
 #[derive(Debug)]
@@ -50,7 +48,7 @@ impl SweepEncoder {
             layers: (0..layers).map(layer).collect(),
             norm: LayerNorm::new(&(path / "norm"), width),
             mask: Dense::new(&(path / "mask"), width, 1, 0.1),
-            feature_norm: Norm::with_eps(&(path / "feature_norm"), width, FEATURE_NORM.0, FEATURE_NORM.1),
+            feature_norm: Norm::with_defaults(&(path / "feature_norm"), width),
         }
     }
 

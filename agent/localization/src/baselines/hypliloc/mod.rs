@@ -7,9 +7,10 @@
 //! instead of 4,096, half as many channels, and a residual network of 16 to 128 channels without pretraining, on an
 //! image of half the columns, to 46 tokens instead of 23.
 //!
-//! Departures: the heading is a cosine and a sine instead of a log-quaternion, since vehicles head in all directions; the image has the channels x, y, z and range, for the mean of tokens would not tell a direction otherwise; a
-//! head of the attention has a ball of its own and returns from it by the logarithm before the layer norm; the learnt
-//! metric begins as the identity; heads normalise the means of tokens over the batch.
+//! Departures: the heading is a cosine and a sine instead of a log-quaternion, since vehicles head in all directions;
+//! the image has the channels x, y, z and range, for the mean of tokens would not tell a direction otherwise; a head of
+//! the attention has a ball of its own and returns from it by the logarithm before the layer norm; the learnt metric
+//! begins as the identity; batch norm of the mean tokens before each head; place classification as an auxiliary loss.
 
 mod config;
 mod dense_norm;

@@ -7,9 +7,6 @@ use tch::{Kind, TchError, Tensor};
 use super::network::WIDTH;
 use crate::pgc::dense::Dense;
 
-/// Epsilon and momentum of the norm of features.
-const NORM: (f64, f64) = (1e-5, 0.1);
-
 /// Poses as the network states them.
 #[derive(Debug)]
 pub struct NormalisedPoses {
@@ -34,11 +31,11 @@ impl PoseHead {
             let layer = |number: usize, from, to, gain| Dense::new(&(path / name / number), from, to, gain);
             [layer(0, WIDTH, 128, 1.0), layer(1, 128, 64, 1.0), layer(2, 64, outputs, 0.1)]
         };
-        let norm = Norm::with_eps(&(path / "norm"), WIDTH, NORM.0, NORM.1);
+        let norm = Norm::with_defaults(&(path / "norm"), WIDTH);
         Self { norm, position: chain("position", 3), heading: chain("heading", 2) }
     }
 
-    /// `[S, WIDTH]`: means of tokens `[S, T, WIDTH]`, which are nearly the same for all sweeps, normalised over the batch.
+    /// `[S, WIDTH]`: batch norm of the mean of tokens `[S, T, WIDTH]`, which is nearly the same for all sweeps.
     ///
     /// # Errors
     /// Those of the tensor library.
