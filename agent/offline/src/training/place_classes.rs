@@ -1,7 +1,7 @@
 //! Place classes: an auxiliary classification loss for networks that regress poses from random weights.
 //!
-//! The published networks are pretrained on large image collections. Not in their papers; the classifier is not used for
-//! localization.
+//! The published networks are pretrained on large image collections. Not in their papers; the classifier is not used
+//! for localization.
 
 use tch::nn::{self, LinearConfig, Module};
 use tch::{Kind, Reduction, TchError, Tensor};

@@ -8,8 +8,8 @@
 //! paper has a foundation model of 21 million parameters; a denoiser of three layers; cosine and sine of the heading in
 //! place of a quaternion's logarithm, since vehicles head in all directions and stand upright; batch
 //! norm of the pooled features, which are nearly the same for all sweeps otherwise; the denoiser predicts the velocity
-//! instead of the noise, whose errors are amplified twelve times in the pose at the last step; place classification as an
-//! auxiliary loss; augmentation by turns of 20 degrees and shifts of 1 m instead of 45 degrees and up to 5 m.
+//! instead of the noise, whose errors are amplified twelve times in the pose at the last step; place classification as
+//! an auxiliary loss; augmentation by turns of 20 degrees and shifts of 1 m instead of 45 degrees and up to 5 m.
 
 mod config;
 mod context_stem;

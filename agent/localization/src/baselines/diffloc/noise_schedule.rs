@@ -55,8 +55,8 @@ impl NoiseSchedule {
         poses.f_mul(&factor(signal)?)?.f_add(&noise.f_mul(&factor(deviation)?)?)
     }
 
-    /// Target of the denoiser at steps `[W]`: the velocity (Salimans and Ho 2022) `[W, F, D]` of poses and `noise` of the
-    /// same shape. It is near the noise at the first steps and near the negated pose at the last.
+    /// Target of the denoiser at steps `[W]`: the velocity (Salimans and Ho 2022) `[W, F, D]` of poses and `noise` of
+    /// the same shape. It is near the noise at the first steps and near the negated pose at the last.
     ///
     /// # Errors
     /// Those of the tensor library.

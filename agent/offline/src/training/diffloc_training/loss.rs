@@ -1,5 +1,5 @@
-//! Loss of DiffLoc: L1 of the predicted velocity and of its differences between sweeps, cross entropy of the mask and of
-//! places.
+//! Loss of DiffLoc: L1 of the predicted velocity and of its differences between sweeps, cross entropy of the mask and
+//! of places.
 
 use tch::{Kind, Reduction, TchError, Tensor};
 
