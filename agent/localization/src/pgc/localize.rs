@@ -449,8 +449,54 @@ fn every_nth(rows: &[usize], count: usize) -> Vec<usize> {
 mod tests {
     use std::collections::BTreeMap;
 
-    use super::*;
+    use dataset::LoadOptions;
+    use nalgebra::Translation3;
     use perception::weights::{self, Precision};
+    use simulator::generate::{Subset, SynthOptions, generate};
+
+    use super::*;
+
+    /// A sweep of town 1 and its pose.
+    fn town1_sweep() -> (PointCloud, Isometry3<f64>) {
+        let folder = tempfile::tempdir().unwrap();
+        let out = folder.path().join("scene");
+        generate(&SynthOptions { frames: 1, ..SynthOptions::new(Subset::Town1loc, 450, out.clone()) }, &|_| ())
+            .unwrap();
+        let frame = dataset::open(&out).unwrap().scenarios[0].load(0, 0, &LoadOptions::default()).unwrap();
+        (frame.points, frame.world_from_lidar.unwrap().isometry())
+    }
+
+    fn released(name: &str) -> std::path::PathBuf {
+        Path::new(env!("CARGO_MANIFEST_DIR")).join("../../deploy/weights").join(name)
+    }
+
+    #[test]
+    fn a_pose_further_along_the_street_is_mended() {
+        tch::set_num_threads(1);
+        let files = ["pgc-encoder.safetensors", "pgc-town1.safetensors"].map(released);
+        let localizer = Localizer::load(&files[0], &files[1], Inference::default()).unwrap();
+        let (cloud, truth) = town1_sweep();
+        let mut times = LocalizerTimes::default();
+        let encoded = localizer.encode(LocalizerInput::of(&cloud), &mut times).unwrap().unwrap();
+        let logits = localizer.classify(&encoded).unwrap();
+        let coordinates = localizer.regress(&encoded, CELLS, &logits, &mut times).unwrap();
+        let (head, solver) = (&localizer.head, &localizer.solver);
+        let search = PoseSearch { head, solver, kind: Kind::Float };
+        let mut origin_from_sensor = truth;
+        origin_from_sensor.translation.vector -= Vector3::from(coordinates.origin_m);
+        let mut times = SearchTimes::default();
+        for (ahead_m, is_mended) in [(-8.0, true), (9.0, true), (40.0, false)] {
+            let wrong = solver.registration_at(&coordinates, origin_from_sensor * Translation3::new(ahead_m, 0.0, 0.0));
+            let inlier_ratio = wrong.inlier_ratio;
+            let solved = Ok(solver.judge(&coordinates, &wrong, None));
+            let wrong = Attempt { solved, inlier_ratio };
+            let found = search.run_along(wrong, &coordinates, &encoded.refinement_cells, &mut times).unwrap();
+            assert_eq!(found.is_sufficient(), is_mended, "{ahead_m} m ahead: {}", found.inlier_ratio);
+            let pose = found.into_solved().unwrap().world_from_sensor;
+            let off_m = (pose.translation.vector - truth.translation.vector).norm();
+            assert_eq!(off_m < 0.3, is_mended, "{ahead_m} m ahead: {off_m} m");
+        }
+    }
 
     #[test]
     fn a_confidence_that_would_fail_on_a_sweep_is_rejected_with_its_file() {

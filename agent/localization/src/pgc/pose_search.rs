@@ -43,9 +43,9 @@ pub struct PoseSearch<'a> {
 /// Best pose of the searches so far.
 #[derive(Debug)]
 pub struct Attempt {
-    solved: Solved,
+    pub(super) solved: Solved,
     /// Final inlier ratio, negative without a pose.
-    inlier_ratio: f64,
+    pub(super) inlier_ratio: f64,
 }
 
 impl Attempt {
