@@ -180,7 +180,7 @@ fn sgloc_learns_on_the_features_of_an_encoder_that_stays_as_it_is() {
 }
 
 #[test]
-fn diffloc_learns_to_predict_velocities_and_answers_alike_for_the_same_sweep() {
+fn diffloc_learns_to_denoise_poses_and_answers_alike_for_the_same_sweep() {
     let _generator = random_generator_lock();
     let dir = tempfile::tempdir().unwrap();
     let scenes = drives(dir.path());
@@ -194,6 +194,7 @@ fn diffloc_learns_to_predict_velocities_and_answers_alike_for_the_same_sweep() {
             width: 32,
             heads: 2,
             layers: 1,
+            denoiser_width: 32,
             denoiser_layers: 1,
             ..DiffLocConfig::small()
         },
@@ -201,18 +202,18 @@ fn diffloc_learns_to_predict_velocities_and_answers_alike_for_the_same_sweep() {
         shift_m: 0.5,
         run: RunConfig { batch: 24, learning_rate: 5e-3, ..run(&dir.path().join("diffloc"), steps) },
     };
-    let (mut velocity, mut found_m) = (Vec::new(), Vec::new());
+    let (mut poses_l1, mut found_m) = (Vec::new(), Vec::new());
     let summary = train_diffloc(&config(200), &mut |report| match report {
         DiffLocReport::Imaging(..) => {}
-        DiffLocReport::Stepped { velocity_l1, accuracy, .. } => {
-            velocity.push(*velocity_l1);
+        DiffLocReport::Stepped { pose_l1, accuracy, .. } => {
+            poses_l1.push(*pose_l1);
             found_m.push(accuracy.p50_m);
         }
         DiffLocReport::Validated(..) => {}
     })
     .unwrap();
     assert_eq!(summary.sweeps, 48);
-    assert!(velocity.last().unwrap() < &(0.7 * velocity[0]), "{velocity:?} {found_m:?} {:?}", summary.validation);
+    assert!(poses_l1.last().unwrap() < &(0.7 * poses_l1[0]), "{poses_l1:?} {found_m:?} {:?}", summary.validation);
     // Far too short to find places: the error is only measured.
     assert!(summary.validation.unwrap().p50_m.is_finite());
 

@@ -21,7 +21,7 @@ pub struct DiffLocConfig {
     pub patch: [i64; 2],
     /// Channels of the three blocks at the image's resolution, and of the last one.
     pub stem: [i64; 2],
-    /// Channels of a token and of the denoiser.
+    /// Channels of a token.
     pub width: i64,
     /// Attention heads.
     pub heads: i64,
@@ -29,6 +29,8 @@ pub struct DiffLocConfig {
     pub layers: usize,
     /// Share of samples for which the last of these layers is skipped in training; falls to 0 at the first.
     pub drop_path: f64,
+    /// Channels of the denoiser.
+    pub denoiser_width: i64,
     /// Layers of the denoiser.
     pub denoiser_layers: usize,
     /// Sweeps of a window in training.
@@ -36,7 +38,7 @@ pub struct DiffLocConfig {
 }
 
 impl DiffLocConfig {
-    /// The small network: 16 x 256 images, 256 tokens, 192 channels.
+    /// The small network: 16 x 256 images, 256 tokens of 128 channels.
     #[must_use]
     pub fn small() -> Self {
         Self {
@@ -45,11 +47,12 @@ impl DiffLocConfig {
             scale_m: [1.0; 3],
             image: RangeImageConfig::default(),
             patch: [2, 8],
-            stem: [32, 32],
-            width: 192,
-            heads: 3,
-            layers: 6,
+            stem: [16, 32],
+            width: 128,
+            heads: 2,
+            layers: 4,
             drop_path: 0.1,
+            denoiser_width: 192,
             denoiser_layers: 3,
             frames: 3,
         }
@@ -79,8 +82,10 @@ impl DiffLocConfig {
         if height < 1 || width < 1 || rows as i64 % height != 0 || columns as i64 % width != 0 {
             return wrong(format!("patch {height} x {width} does not divide an image of {rows} x {columns}"));
         }
-        if self.heads < 1 || self.width < 1 || self.width > 4096 || self.width % self.heads != 0 {
-            return wrong(format!("width {} for {} heads", self.width, self.heads));
+        for width in [self.width, self.denoiser_width] {
+            if self.heads < 1 || !(1..=4096).contains(&width) || width % self.heads != 0 {
+                return wrong(format!("width {width} for {} heads", self.heads));
+            }
         }
         if self.stem.iter().any(|channels| !(1..=1024).contains(channels)) {
             return wrong(format!("stem of {:?} channels, expected 1 to 1024", self.stem));

@@ -51,8 +51,8 @@ impl PoseDenoiser {
     /// # Errors
     /// Those of the tensor library.
     pub fn new(path: &nn::Path<'_>, config: &DiffLocConfig) -> Result<Self, TchError> {
-        let DiffLocConfig { width, heads, denoiser_layers, .. } = *config;
-        let inputs = POSE * (2 * HARMONICS + 1) + STEP_CHANNELS + width + 1;
+        let DiffLocConfig { denoiser_width: width, heads, denoiser_layers, .. } = *config;
+        let inputs = POSE * (2 * HARMONICS + 1) + STEP_CHANNELS + config.width + 1;
         let layer = |number: usize| TransformerLayer::new(&(path / "layers" / number), width, heads, EXPANSION, 0.0);
         let half = STEP_CHANNELS / 2;
         let harmonics: Vec<f32> = (0..HARMONICS).map(|power| (1_u32 << power) as f32).collect();

@@ -114,6 +114,7 @@ mod tests {
             width: 8,
             heads: 2,
             layers: 2,
+            denoiser_width: 12,
             denoiser_layers: 1,
             ..DiffLocConfig::small()
         }

@@ -18,8 +18,8 @@ pub const WIDTH: i64 = 256;
 /// Poses from the tokens of each branch.
 #[derive(Debug)]
 pub struct BranchPoses {
-    /// `[S, WIDTH]`: features of the fusion, from which its pose comes.
-    pub features: Tensor,
+    /// Each `[S, WIDTH]`: features from which the poses of points, image and fusion come.
+    pub features: [Tensor; 3],
     /// From points alone.
     pub points: NormalisedPoses,
     /// From the image alone.
@@ -83,11 +83,15 @@ impl HypLiLoc {
         let fused = self.second.forward(&fused_points, &tokens_of(&fused_map)?)?;
 
         let [point_head, image_head, fusion_head] = &self.heads;
-        let features = fusion_head.features(&fused, train)?;
+        let features = [
+            point_head.features(&points, train)?,
+            image_head.features(&image, train)?,
+            fusion_head.features(&fused, train)?,
+        ];
         Ok(BranchPoses {
-            points: point_head.forward(&point_head.features(&points, train)?)?,
-            image: image_head.forward(&image_head.features(&image, train)?)?,
-            fusion: fusion_head.forward(&features)?,
+            points: point_head.forward(&features[0])?,
+            image: image_head.forward(&features[1])?,
+            fusion: fusion_head.forward(&features[2])?,
             features,
         })
     }

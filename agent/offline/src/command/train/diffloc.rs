@@ -26,7 +26,7 @@ pub(crate) struct Args {
     #[arg(long, default_value_t = 48)]
     batch: usize,
     /// Highest learning rate.
-    #[arg(long, default_value_t = 1.5e-3)]
+    #[arg(long, default_value_t = 2e-3)]
     lr: f64,
     #[command(flatten)]
     turns: SensorTurns,
@@ -86,11 +86,11 @@ impl Args {
 fn show(bar: &TrainingBar, report: &DiffLocReport) {
     match report {
         DiffLocReport::Imaging(done, total) => bar.encoded(*done, *total),
-        DiffLocReport::Stepped { step, share_done, seconds, velocity_l1, place_loss, accuracy } => {
+        DiffLocReport::Stepped { step, share_done, seconds, pose_l1, place_loss, accuracy } => {
             bar.report(
                 *share_done,
                 *seconds,
-                &format!("step {step} velocity {velocity_l1:.3} places {place_loss:.2}, batch {}", text(accuracy)),
+                &format!("step {step} poses {pose_l1:.3} places {place_loss:.2}, batch {}", text(accuracy)),
             );
         }
         DiffLocReport::Validated(seconds, accuracy) => {

@@ -18,7 +18,7 @@ pub(crate) struct Args {
     #[arg(long, default_value_t = 32)]
     batch: usize,
     /// Highest learning rate.
-    #[arg(long, default_value_t = 5e-4)]
+    #[arg(long, default_value_t = 1.5e-3)]
     lr: f64,
     #[command(flatten)]
     options: TrainingOptions,
@@ -36,9 +36,17 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     let mut latest = None;
     let trained = train_hypliloc(&config, &mut |report| match *report {
         HypLiLocReport::Sampling(done, total) => bar.encoded(done, total),
-        HypLiLocReport::Stepped { step, share_done, seconds, error_m, error_deg } => {
+        HypLiLocReport::Stepped {
+            step,
+            share_done,
+            seconds,
+            error_m,
+            error_deg,
+            place_losses: [points, image, fusion],
+        } => {
             latest = Some((error_m, error_deg));
-            bar.report(share_done, seconds, &format!("step {step} error {error_m:.2} m {error_deg:.1} deg"));
+            let places = format!("places {points:.2} {image:.2} {fusion:.2}");
+            bar.report(share_done, seconds, &format!("step {step} error {error_m:.2} m {error_deg:.1} deg, {places}"));
         }
     })?;
     bar.finish();

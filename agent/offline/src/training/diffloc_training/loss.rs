@@ -1,5 +1,4 @@
-//! Loss of DiffLoc: L1 of the predicted velocity and of its differences between sweeps, cross entropy of the mask and
-//! of places.
+//! Loss of DiffLoc: L1 of the poses and of their differences between sweeps, cross entropy of the mask and of places.
 
 use tch::{Kind, Reduction, TchError, Tensor};
 
@@ -8,22 +7,20 @@ use crate::training::place_classes::PlaceClasses;
 use localization::baselines::diffloc::{CHANNELS, DiffLoc, Windows};
 
 /// Noise levels and noises that are drawn for each window: the denoiser costs little beside the encoder.
-const DRAWS: i64 = 8;
+const DRAWS: i64 = 16;
 /// Share of these whose sweeps do not see each other, as in the localization of a single sweep.
 const SINGLE: f64 = 0.5;
-/// Weight of the differences between sweeps.
-const DIFFERENCE_WEIGHT: f64 = 1.0;
-/// Weight of the mask of static objects.
-const MASK_WEIGHT: f64 = 0.1;
-/// Weight of the classification of places.
-const PLACE_WEIGHT: f64 = 0.5;
+/// Weight of the mask of static objects, relative to that of poses.
+const MASK_WEIGHT: f64 = 0.03;
+/// Weight of the classification of places, relative to that of poses.
+const PLACE_WEIGHT: f64 = 0.15;
 
 /// Result of a batch.
 pub(super) struct Losses {
     /// Weighted sum, with gradient.
     pub(super) total: Tensor,
-    /// Mean L1 of the velocity, without gradient.
-    pub(super) velocity: Tensor,
+    /// Mean L1 of the normalised poses, without gradient.
+    pub(super) pose: Tensor,
     /// Cross entropy of places, without gradient.
     pub(super) place: Tensor,
     /// `[W, F, width]`: features of the sweeps, without gradient.
@@ -45,24 +42,25 @@ pub(super) fn losses(
         encoded.static_logits.f_binary_cross_entropy_with_logits::<Tensor>(&statics, None, None, Reduction::Mean)?;
     let place = places.loss(&encoded.features, &batch.poses)?;
     let features = encoded.features.f_view([-1, frames, network.config().width])?;
-    let [velocity, differences] = velocity_losses(network, &features, &batch.poses.f_view([-1, frames, 5])?)?;
-    let total = &velocity + differences * DIFFERENCE_WEIGHT + mask * MASK_WEIGHT + &place * PLACE_WEIGHT;
-    Ok(Losses { total, velocity: velocity.f_detach()?, place: place.f_detach()?, features: features.f_detach()? })
+    let [pose, differences] = pose_losses(network, &features, &batch.poses.f_view([-1, frames, 5])?)?;
+    let total = &pose + differences + mask * MASK_WEIGHT + &place * PLACE_WEIGHT;
+    Ok(Losses { total, pose: pose.f_detach()?, place: place.f_detach()?, features: features.f_detach()? })
 }
 
-/// L1 of the velocity, and of its differences between sweeps that see each other.
-fn velocity_losses(network: &DiffLoc, features: &Tensor, poses: &Tensor) -> Result<[Tensor; 2], TchError> {
+/// L1 of the poses, and of their differences between sweeps that see each other.
+fn pose_losses(network: &DiffLoc, features: &Tensor, poses: &Tensor) -> Result<[Tensor; 2], TchError> {
     let drawn = |of: &Tensor| of.f_repeat([DRAWS, 1, 1]);
     let (features, poses) = (drawn(features)?, drawn(poses)?);
     let (count, frames, _) = poses.size3()?;
     let on = (Kind::Float, poses.device());
     let schedule = network.schedule();
-    let steps = Tensor::f_randint(schedule.steps(), [count], (Kind::Int64, on.1))?;
+    // The larger of two: where noise hides the pose, it has to come from the features.
+    let steps = Tensor::f_randint(schedule.steps(), [2, count], (Kind::Int64, on.1))?.f_amax(0_i64, false)?;
     let noise = Tensor::f_randn(poses.size(), on)?;
     let joint = Tensor::f_rand([count], on)?.f_ge(SINGLE)?.f_to_kind(Kind::Float)?;
     let noisy = schedule.add_noise(&poses, &noise, &steps)?;
-    let found = network.denoiser().forward(&noisy, &steps, &features, Windows::Joint(&joint))?;
-    let error = found.f_sub(&schedule.velocity(&poses, &noise, &steps)?)?;
+    let velocity = network.denoiser().forward(&noisy, &steps, &features, Windows::Joint(&joint))?;
+    let error = schedule.poses(&noisy, &velocity, &steps)?.f_sub(&poses)?;
     let mean = error.f_abs()?.f_mean(Kind::Float)?;
     if frames < 2 {
         let none = mean.f_zeros_like()?;

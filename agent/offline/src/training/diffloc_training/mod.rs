@@ -31,7 +31,7 @@ const REPORT_EVERY: u64 = 50;
 /// Steps between two checkpoints and validations.
 const CHECKPOINT_EVERY: u64 = 1000;
 /// Columns of the training curve.
-const CURVE: &str = "step,seconds,velocity_l1,place_loss,p50_m,success_3m,validation_p50_m,validation_success_3m";
+const CURVE: &str = "step,seconds,pose_l1,place_loss,p50_m,success_3m,validation_p50_m,validation_success_3m";
 
 /// Configuration of a training of DiffLoc.
 #[derive(Debug, Clone)]
@@ -63,8 +63,8 @@ pub enum DiffLocReport {
         share_done: f64,
         /// Seconds spent.
         seconds: f64,
-        /// Mean L1 of the velocity since the last report.
-        velocity_l1: f64,
+        /// Mean L1 of the normalised poses, at all steps of the diffusion, since the last report.
+        pose_l1: f64,
         /// Mean cross entropy of places since the last report.
         place_loss: f64,
         /// Accuracy on the last batch.
@@ -157,21 +157,20 @@ impl Training<'_> {
             let step = self.trainer.steps();
             if self.trainer.is_report_due(REPORT_EVERY) || self.share_done() >= 1.0 {
                 let mean = Tensor::f_stack(&means, 0)?.f_mean_dim(0_i64, false, Kind::Double)?;
-                let (velocity_l1, place_loss) = (mean.f_double_value(&[0])?, mean.f_double_value(&[1])?);
+                let (pose_l1, place_loss) = (mean.f_double_value(&[0])?, mean.f_double_value(&[1])?);
                 means.clear();
                 let seconds = self.trainer.seconds();
                 let accuracy = accuracy(&self.network, &losses.features, &losses.poses, &self.images.normalisation)?;
                 let share_done = self.share_done().min(1.0);
-                observe(&DiffLocReport::Stepped { step, share_done, seconds, velocity_l1, place_loss, accuracy });
+                observe(&DiffLocReport::Stepped { step, share_done, seconds, pose_l1, place_loss, accuracy });
                 if step.is_multiple_of(CHECKPOINT_EVERY) || share_done >= 1.0 {
                     self.trainer.checkpoint(&self.variables)?;
                     self.validate(observe)?;
                 }
                 let of = |accuracy: DiffLocAccuracy| [accuracy.p50_m, accuracy.success_3m];
                 let validated = self.last.map_or([f64::NAN; 2], of);
-                curve.numbers(
-                    &[&[step as f64, seconds, velocity_l1, place_loss], &of(accuracy)[..], &validated].concat(),
-                )?;
+                curve
+                    .numbers(&[&[step as f64, seconds, pose_l1, place_loss], &of(accuracy)[..], &validated].concat())?;
             }
         }
         Ok(())
@@ -198,7 +197,7 @@ impl Training<'_> {
         let losses = losses(network, places, &batch, frames, run.precision.kind())?;
         let share_done = self.share_done();
         self.trainer.step(&losses.total, share_done)?;
-        let means = Tensor::f_stack(&[losses.velocity, losses.place], 0)?;
+        let means = Tensor::f_stack(&[losses.pose, losses.place], 0)?;
         Ok(StepLosses { means, features: losses.features.f_flatten(0, 1)?, poses: batch.poses })
     }
 
@@ -214,7 +213,7 @@ impl Training<'_> {
 
 /// A step's loss and sweeps, on the device.
 struct StepLosses {
-    /// `[2]`: L1 of the velocity, cross entropy of places.
+    /// `[2]`: L1 of the poses, cross entropy of places.
     means: Tensor,
     /// `[N, width]`.
     features: Tensor,

@@ -78,7 +78,7 @@ mod tests {
         let truth = Truth { position: rows([0.0; 3]), heading: rows([1.0, 0.0]) };
         let loss = |offs: [f32; 3]| {
             let [points, image, fusion] = offs.map(pose);
-            let poses = BranchPoses { points, image, fusion, features: rows([0.0]) };
+            let poses = BranchPoses { points, image, fusion, features: [0.0; 3].map(|of| rows([of])) };
             no_grad(|| criteria.loss(&poses, &truth)).unwrap().double_value(&[])
         };
         // Three times -3, and for an error of 0.1 in one branch 0.1 of the position and 0.05 e^3 of the heading.

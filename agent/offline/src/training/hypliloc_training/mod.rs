@@ -8,8 +8,8 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::time::Instant;
 
-use tch::nn::VarStore;
-use tch::{Cuda, Kind, Tensor};
+use tch::nn::{self, VarStore};
+use tch::{Cuda, Kind, TchError, Tensor};
 
 use super::error::LocalizerTrainError;
 use super::place_classes::PlaceClasses;
@@ -59,7 +59,26 @@ pub enum HypLiLocReport {
         error_m: f64,
         /// Mean heading error of the fusion since the last report, degrees.
         error_deg: f64,
+        /// Mean cross entropy of places by points, image and fusion since the last report.
+        place_losses: [f64; 3],
     },
+}
+
+/// Place classification by the features of each branch.
+struct BranchPlaces([PlaceClasses; 3]);
+
+impl BranchPlaces {
+    fn new(path: &nn::Path<'_>, examples: &Examples, seed: u64) -> Result<Self, LocalizerTrainError> {
+        let poses = examples.poses()?;
+        let of = |branch: &str| PlaceClasses::new(&(path / branch), WIDTH, &poses, examples.deviation_m, seed);
+        Ok(Self([of("points")?, of("image")?, of("fusion")?]))
+    }
+
+    /// `[3]` cross entropies of the features of points, image and fusion.
+    fn losses(&self, features: &[Tensor; 3], poses: &Tensor) -> Result<Tensor, TchError> {
+        let losses = self.0.iter().zip(features).map(|(places, features)| places.loss(features, poses));
+        Tensor::f_stack(&losses.collect::<Result<Vec<_>, _>>()?, 0)
+    }
 }
 
 /// Trains a network; writes checkpoint and weights into `config.run.out`.
@@ -76,8 +95,7 @@ pub fn train_hypliloc(
     let variables = VarStore::new(run.device);
     let network = HypLiLoc::new(&variables.root());
     let criteria = Criteria::new(&(variables.root() / "criteria"));
-    let places = variables.root() / "places";
-    let places = PlaceClasses::new(&places, WIDTH, &examples.poses()?, examples.deviation_m, run.seed)?;
+    let places = BranchPlaces::new(&(variables.root() / "places"), &examples, run.seed)?;
     let mut trainer = Trainer::begin(run, &variables, None, Instant::now())?;
     // The tensor library draws all random numbers of a step, on the device.
     tch::manual_seed(run.seed.wrapping_add(trainer.steps()) as i64);
@@ -85,23 +103,30 @@ pub fn train_hypliloc(
     let share_done =
         |trainer: &Trainer| trainer.share_done((trainer.steps() * run.batch as u64) as f64 / examples.len() as f64);
     let mut reported = trainer.steps();
-    let mut errors = Tensor::f_zeros([2], (Kind::Float, run.device))?;
+    let mut sums = Tensor::f_zeros([5], (Kind::Float, run.device))?;
     while share_done(&trainer) < 1.0 {
         let (batch, truth) = augment(examples.draw(run.batch as i64)?, config.turn_rad)?;
         let poses = network.forward(&batch, run.precision.kind(), true)?;
-        let loss = criteria.loss(&poses, &truth)? + places.loss(&poses.features, &truth.poses()?)? * PLACE_WEIGHT;
+        let place_losses = places.losses(&poses.features, &truth.poses()?)?;
+        let loss = criteria.loss(&poses, &truth)? + place_losses.f_sum(Kind::Float)? * PLACE_WEIGHT;
         trainer.step(&loss, share_done(&trainer))?;
         trainer.check_interruption(&variables)?;
-        errors += mean_errors(&poses.fusion, &truth, &examples.scale_m)?;
+        let errors = mean_errors(&poses.fusion, &truth, &examples.scale_m)?;
+        sums += Tensor::f_cat(&[errors, place_losses.f_detach()?], 0)?;
         let step = trainer.steps();
         if trainer.is_report_due(REPORT_EVERY) {
             let steps = (step - reported) as f64;
             reported = step;
-            let mean: Vec<f64> = Vec::try_from(&(&errors / steps).f_to_kind(Kind::Double)?)?;
-            let _ = errors.f_zero_()?;
-            let share_done = share_done(&trainer).min(1.0);
-            let (error_m, error_deg) = (mean[0], mean[1].to_degrees());
-            observe(&HypLiLocReport::Stepped { step, share_done, seconds: trainer.seconds(), error_m, error_deg });
+            let mean: Vec<f64> = Vec::try_from(&(&sums / steps).f_to_kind(Kind::Double)?)?;
+            let _ = sums.f_zero_()?;
+            observe(&HypLiLocReport::Stepped {
+                step,
+                share_done: share_done(&trainer).min(1.0),
+                seconds: trainer.seconds(),
+                error_m: mean[0],
+                error_deg: mean[1].to_degrees(),
+                place_losses: [mean[2], mean[3], mean[4]],
+            });
         }
         if step.is_multiple_of(CHECKPOINT_EVERY) {
             trainer.checkpoint(&variables)?;
