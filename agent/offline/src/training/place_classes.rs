@@ -15,46 +15,49 @@ const HEADING_M: f64 = 15.0;
 /// Label smoothing, as in LightLoc's classifier.
 const LABEL_SMOOTHING: f64 = 0.1;
 
-/// Classifier of features by the nearest of some training poses.
-pub(super) struct PlaceClasses {
-    layer: nn::Linear,
+/// Classifiers of features by the nearest of some training poses, one for each branch of a network.
+pub(super) struct PlaceClasses<const BRANCHES: usize> {
+    layers: [nn::Linear; BRANCHES],
     /// `[5]`: metres of each number of a pose.
     units_m: Tensor,
     /// `[classes, 5]`, metres.
     centres_m: Tensor,
 }
 
-impl PlaceClasses {
-    /// Clusters training poses `[S, 5]` (position in units of `scale_m`, cosine and sine of the heading), and builds a
-    /// layer for features of `width` channels below `path`.
+impl<const BRANCHES: usize> PlaceClasses<BRANCHES> {
+    /// Clusters training poses `[S, 5]` (position in units of `scale_m`, cosine and sine of the heading), and builds
+    /// a layer for features of `width` channels below each of `paths`.
     ///
     /// # Errors
     /// Those of the tensor library.
     pub(super) fn new(
-        path: &nn::Path<'_>,
+        paths: [nn::Path<'_>; BRANCHES],
         width: i64,
         poses: &Tensor,
         scale_m: [f64; 3],
         seed: u64,
     ) -> Result<Self, TchError> {
         let units_m = scale_m.into_iter().chain([HEADING_M; 2]).map(|unit| unit as f32).collect::<Vec<f32>>();
-        let units_m = Tensor::f_from_slice(&units_m)?.f_to_device(path.device())?;
+        let units_m = Tensor::f_from_slice(&units_m)?.f_to_device(poses.device())?;
         let rows: Vec<f64> = Vec::try_from(&poses.f_mul(&units_m)?.f_to_kind(Kind::Double)?.f_reshape([-1])?)?;
         let (rows, _) = rows.as_chunks::<5>();
         let (centres, _) = kmeans(rows, CLASSES, seed);
         let centres_m = Tensor::f_from_slice(centres.as_flattened())?.f_to_kind(Kind::Float)?.f_view([-1, 5])?;
-        let layer = nn::linear(path, width, centres.len() as i64, LinearConfig::default());
-        Ok(Self { layer, units_m, centres_m: centres_m.f_to_device(path.device())? })
+        let layers = paths.map(|path| nn::linear(path, width, centres.len() as i64, LinearConfig::default()));
+        Ok(Self { layers, units_m, centres_m: centres_m.f_to_device(poses.device())? })
     }
 
-    /// Cross entropy of features `[N, width]` of sweeps with `poses` `[N, 5]`.
+    /// `[BRANCHES]`: cross entropy of each branch's features `[N, width]` of sweeps with `poses` `[N, 5]`.
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub(super) fn loss(&self, features: &Tensor, poses: &Tensor) -> Result<Tensor, TchError> {
-        let logits = self.layer.forward(features);
-        let weight = None::<Tensor>;
-        logits.f_cross_entropy_loss(&self.classes(poses)?, weight, Reduction::Mean, -100, LABEL_SMOOTHING)
+    pub(super) fn losses(&self, features: [&Tensor; BRANCHES], poses: &Tensor) -> Result<Tensor, TchError> {
+        let classes = self.classes(poses)?;
+        let losses = self.layers.iter().zip(features).map(|(layer, features)| {
+            let logits = layer.forward(features);
+            logits.f_cross_entropy_loss(&classes, None::<Tensor>, Reduction::Mean, -100, LABEL_SMOOTHING)
+        });
+        Tensor::f_stack(&losses.collect::<Result<Vec<_>, _>>()?, 0)
     }
 
     /// `[N]`: the nearest centre of each of `poses` `[N, 5]`.
@@ -84,7 +87,7 @@ mod tests {
     #[test]
     fn places_and_directions_are_classes_of_their_own() {
         let variables = VarStore::new(Device::Cpu);
-        let classes = PlaceClasses::new(&variables.root(), 8, &poses(), [100.0, 100.0, 1.0], 0).unwrap();
+        let classes = PlaceClasses::new([variables.root()], 8, &poses(), [100.0, 100.0, 1.0], 0).unwrap();
         let found: Vec<i64> = Vec::try_from(classes.classes(&poses()).unwrap()).unwrap();
         let mut sorted = found.clone();
         sorted.sort_unstable();
@@ -98,14 +101,14 @@ mod tests {
     #[test]
     fn features_that_tell_the_class_have_a_small_loss() {
         let variables = VarStore::new(Device::Cpu);
-        let classes = PlaceClasses::new(&variables.root(), 4, &poses(), [100.0, 100.0, 1.0], 0).unwrap();
+        let classes = PlaceClasses::new([variables.root()], 4, &poses(), [100.0, 100.0, 1.0], 0).unwrap();
         let own = classes.classes(&poses()).unwrap().one_hot(4).to_kind(Kind::Float);
         tch::no_grad(|| {
             let named = variables.variables();
             named["weight"].shallow_clone().copy_(&(Tensor::eye(4, (Kind::Float, Device::Cpu)) * 20.0));
             let _ = named["bias"].shallow_clone().zero_();
         });
-        let loss = |features: &Tensor| classes.loss(features, &poses()).unwrap().double_value(&[]);
+        let loss = |features: &Tensor| classes.losses([features], &poses()).unwrap().double_value(&[0]);
         assert!(loss(&own) + 3.0 < loss(&own.roll([1], [0])), "{} {}", loss(&own), loss(&own.roll([1], [0])));
     }
 }

@@ -82,9 +82,9 @@ impl DiffLocConfig {
         if height < 1 || width < 1 || rows as i64 % height != 0 || columns as i64 % width != 0 {
             return wrong(format!("patch {height} x {width} does not divide an image of {rows} x {columns}"));
         }
-        for width in [self.width, self.denoiser_width] {
+        for (name, width) in [("width", self.width), ("denoiser_width", self.denoiser_width)] {
             if self.heads < 1 || !(1..=4096).contains(&width) || width % self.heads != 0 {
-                return wrong(format!("width {width} for {} heads", self.heads));
+                return wrong(format!("{name} {width} for {} heads", self.heads));
             }
         }
         if self.stem.iter().any(|channels| !(1..=1024).contains(channels)) {

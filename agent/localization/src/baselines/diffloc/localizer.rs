@@ -197,6 +197,7 @@ mod tests {
             (DiffLocConfig { patch: [3, 4], ..config() }, "patch 3 x 4"),
             (DiffLocConfig { patch: [0, 4], ..config() }, "patch 0 x 4"),
             (DiffLocConfig { heads: 3, ..config() }, "width 8 for 3 heads"),
+            (DiffLocConfig { denoiser_width: 13, ..config() }, "denoiser_width 13 for 2 heads"),
             (DiffLocConfig { scale_m: [0.0; 3], ..config() }, "scale_m [0.0"),
             (DiffLocConfig { layers: 1000, ..config() }, "1000"),
         ] {

@@ -6,11 +6,11 @@
 //!
 //! Departures from the paper: a transformer of four layers of 128 channels with random weights at the start, where the
 //! paper has a foundation model of 21 million parameters; a denoiser of three layers; cosine and sine of the heading in
-//! place of a quaternion's logarithm, since vehicles head in all directions and stand upright; batch
-//! norm of the pooled features, which are nearly the same for all sweeps otherwise; the denoiser predicts the velocity
-//! instead of the noise, whose errors are amplified twelve times in the pose at the last step, and its loss is the error
-//! of the pose; noise is drawn sixteen times for each window, strong noise more often; place classification as
-//! an auxiliary loss; augmentation by turns of 20 degrees and shifts of 1 m instead of 45 degrees and up to 5 m.
+//! place of a quaternion's logarithm, since vehicles head in all directions and stand upright; batch norm of the pooled
+//! features, which are nearly the same for all sweeps otherwise; the denoiser predicts the velocity instead of the
+//! noise, whose errors are amplified twelve times in the pose at the last step, and its loss is the error of the pose;
+//! noise is drawn sixteen times for each window, strong noise more often; place classification as an auxiliary loss;
+//! augmentation by turns of 20 degrees and shifts of 1 m instead of 45 degrees and up to 5 m.
 
 mod config;
 mod context_stem;

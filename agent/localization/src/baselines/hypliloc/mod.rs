@@ -10,8 +10,8 @@
 //! Departures: the heading is a cosine and a sine instead of a log-quaternion, since vehicles head in all directions;
 //! the image has the channels x, y, z and range, for the mean of tokens would not tell a direction otherwise; a head of
 //! the attention has a ball of its own and returns from it by the logarithm before the layer norm; the learnt metric
-//! begins as the identity; batch norm of the mean tokens before each head; place classification by each
-//! branch as an auxiliary loss.
+//! begins as the identity; batch norm of the mean tokens before each head; place classification by
+//! each branch as an auxiliary loss.
 
 mod config;
 mod dense_norm;

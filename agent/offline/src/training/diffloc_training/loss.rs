@@ -30,7 +30,7 @@ pub(super) struct Losses {
 /// Losses of windows of `frames` sweeps, one after another.
 pub(super) fn losses(
     network: &DiffLoc,
-    places: &PlaceClasses,
+    places: &PlaceClasses<1>,
     batch: &Augmented,
     frames: i64,
     kind: Kind,
@@ -40,7 +40,7 @@ pub(super) fn losses(
     let statics = static_tokens(&batch.images, network.config().patch)?;
     let mask =
         encoded.static_logits.f_binary_cross_entropy_with_logits::<Tensor>(&statics, None, None, Reduction::Mean)?;
-    let place = places.loss(&encoded.features, &batch.poses)?;
+    let place = places.losses([&encoded.features], &batch.poses)?.f_select(0, 0)?;
     let features = encoded.features.f_view([-1, frames, network.config().width])?;
     let [pose, differences] = pose_losses(network, &features, &batch.poses.f_view([-1, frames, 5])?)?;
     let total = &pose + differences + mask * MASK_WEIGHT + &place * PLACE_WEIGHT;

@@ -116,8 +116,8 @@ pub fn train_diffloc(
     let network_config = DiffLocConfig { origin_m, scale_m, ..config.network.clone() };
     let variables = VarStore::new(run.device);
     let network = DiffLoc::new(&variables.root(), &network_config)?;
-    let places = variables.root() / "places";
-    let places = PlaceClasses::new(&places, network_config.width, &images.poses, scale_m, run.seed)?;
+    let places = [variables.root() / "places"];
+    let places = PlaceClasses::new(places, network_config.width, &images.poses, scale_m, run.seed)?;
     let trainer = Trainer::begin(run, &variables, None, started)?;
     let mut training = Training { config, network, places, variables, images, validation, trainer, last: None };
     training.run(observe)?;
@@ -137,7 +137,7 @@ pub fn train_diffloc(
 struct Training<'a> {
     config: &'a DiffLocTrainConfig,
     network: DiffLoc,
-    places: PlaceClasses,
+    places: PlaceClasses<1>,
     variables: VarStore,
     images: SweepImages,
     validation: Option<SweepImages>,

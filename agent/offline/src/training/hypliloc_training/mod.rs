@@ -8,8 +8,8 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::time::Instant;
 
-use tch::nn::{self, VarStore};
-use tch::{Cuda, Kind, TchError, Tensor};
+use tch::nn::VarStore;
+use tch::{Cuda, Kind, Tensor};
 
 use super::error::LocalizerTrainError;
 use super::place_classes::PlaceClasses;
@@ -22,7 +22,7 @@ use augmentation::augment;
 use criterion::{Criteria, mean_errors};
 use examples::Examples;
 
-/// Weight of the classification of places.
+/// Weight of the classification of places by each branch.
 const PLACE_WEIGHT: f64 = 0.5;
 /// Steps between two reports.
 const REPORT_EVERY: u64 = 20;
@@ -64,23 +64,6 @@ pub enum HypLiLocReport {
     },
 }
 
-/// Place classification by the features of each branch.
-struct BranchPlaces([PlaceClasses; 3]);
-
-impl BranchPlaces {
-    fn new(path: &nn::Path<'_>, examples: &Examples, seed: u64) -> Result<Self, LocalizerTrainError> {
-        let poses = examples.poses()?;
-        let of = |branch: &str| PlaceClasses::new(&(path / branch), WIDTH, &poses, examples.deviation_m, seed);
-        Ok(Self([of("points")?, of("image")?, of("fusion")?]))
-    }
-
-    /// `[3]` cross entropies of the features of points, image and fusion.
-    fn losses(&self, features: &[Tensor; 3], poses: &Tensor) -> Result<Tensor, TchError> {
-        let losses = self.0.iter().zip(features).map(|(places, features)| places.loss(features, poses));
-        Tensor::f_stack(&losses.collect::<Result<Vec<_>, _>>()?, 0)
-    }
-}
-
 /// Trains a network; writes checkpoint and weights into `config.run.out`.
 ///
 /// # Errors
@@ -95,7 +78,8 @@ pub fn train_hypliloc(
     let variables = VarStore::new(run.device);
     let network = HypLiLoc::new(&variables.root());
     let criteria = Criteria::new(&(variables.root() / "criteria"));
-    let places = BranchPlaces::new(&(variables.root() / "places"), &examples, run.seed)?;
+    let places = ["points", "image", "fusion"].map(|branch| variables.root() / "places" / branch);
+    let places = PlaceClasses::new(places, WIDTH, &examples.poses()?, examples.deviation_m, run.seed)?;
     let mut trainer = Trainer::begin(run, &variables, None, Instant::now())?;
     // The tensor library draws all random numbers of a step, on the device.
     tch::manual_seed(run.seed.wrapping_add(trainer.steps()) as i64);
@@ -107,7 +91,7 @@ pub fn train_hypliloc(
     while share_done(&trainer) < 1.0 {
         let (batch, truth) = augment(examples.draw(run.batch as i64)?, config.turn_rad)?;
         let poses = network.forward(&batch, run.precision.kind(), true)?;
-        let place_losses = places.losses(&poses.features, &truth.poses()?)?;
+        let place_losses = places.losses(poses.features.each_ref(), &truth.poses()?)?;
         let loss = criteria.loss(&poses, &truth)? + place_losses.f_sum(Kind::Float)? * PLACE_WEIGHT;
         trainer.step(&loss, share_done(&trainer))?;
         trainer.check_interruption(&variables)?;
